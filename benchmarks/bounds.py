@@ -1,19 +1,19 @@
-"""Bounds: a measured figure, what was asked of it, and whether it holds.
+"""Bounds: a measured figure, the value required of it, and the verdict.
 
-Every figure that a section of docs/verification.md or docs/performance.md claims
-has one; the page shows them as a table.
+Every figure that a section of docs/verification.md or docs/performance.md claims has a bound; the
+page shows the bounds as a table.
 """
 
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 
 UNLIKELY = 1e-4
-"""A count is out of bounds where chance alone gives one as far off less often than this."""
+"""Probability of a deviation by chance below which a count is out of bounds."""
 
 
 @dataclass(frozen=True)
 class Bound:
-    """A measured figure and what was asked of it, both as they are shown."""
+    """Measured figure with its requirement, both as they are shown."""
 
     figure: str
     measured: str
@@ -22,51 +22,51 @@ class Bound:
 
     @property
     def fault(self) -> str:
-        """The figure as the fault that it is where it does not hold."""
+        """Text of a fault: the figure with its measured value and the requirement."""
         return f"{self.figure}: {self.measured}, asked for is {self.asked}"
 
     def as_json(self) -> dict[str, object]:
-        """The bound for a file of results."""
+        """Bound as JSON for a file of results."""
         return asdict(self)
 
 
 def shown(value: object) -> str:
-    """A figure as text: whole numbers grouped, others to four digits."""
+    """Text of a figure: whole numbers grouped, others to four digits."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return str(value)
     return f"{value:,}" if isinstance(value, int) else f"{value:.4g}"
 
 
 def faults_of(bounds: Iterable[Bound]) -> list[str]:
-    """The bounds that do not hold, in words."""
+    """Texts of the bounds that do not hold."""
     return [each.fault for each in bounds if not each.holds]
 
 
 def at_most(figure: str, value: float, most: float, unit: str = "") -> Bound:
-    """A figure that may not exceed a bound."""
+    """Bound of a figure with an upper limit."""
     return Bound(figure, _with(value, unit), f"at most {_with(most, unit)}", value <= most)
 
 
 def at_least(figure: str, value: float, least: float, unit: str = "") -> Bound:
-    """A figure that may not be less than a bound."""
+    """Bound of a figure with a lower limit."""
     return Bound(figure, _with(value, unit), f"at least {_with(least, unit)}", value >= least)
 
 
 def between(figure: str, value: float, least: float, most: float, unit: str = "") -> Bound:
-    """A figure that lies between two bounds."""
+    """Bound of a figure with a lower and an upper limit."""
     asked = f"{shown(least)} to {_with(most, unit)}"
     return Bound(figure, _with(value, unit), asked, least <= value <= most)
 
 
 def equal(figure: str, value: int, expected: int) -> Bound:
-    """A count that is exactly what was expected."""
+    """Bound of a count that must equal an expected one."""
     return Bound(figure, f"{value:,}", f"{expected:,}", value == expected)
 
 
 def share_as_expected(figure: str, hits: int, of: int, expected: float) -> Bound:
-    """A count out of so many, neither more nor fewer than a probability explains.
+    """Bound of a count of hits that must agree with a probability.
 
-    The bounds are the two-sided binomial ones at `UNLIKELY`.
+    The limits are the two-sided binomial ones at `UNLIKELY`.
     """
     from scipy.stats import binom
 
@@ -83,9 +83,9 @@ def share_as_expected(figure: str, hits: int, of: int, expected: float) -> Bound
 def mean_as_expected(
     figure: str, values: Sequence[float], expected: float, variance: float
 ) -> Bound:
-    """The mean of independent values within four standard errors of what was expected.
+    """Bound of the mean of independent values: within four standard errors of the expected one.
 
-    `variance` is that which one value should have.
+    `variance` is the expected variance of a single value.
     """
     slack = 4.0 * (variance / len(values)) ** 0.5
     mean = sum(values) / len(values)
@@ -94,7 +94,7 @@ def mean_as_expected(
 
 
 def every(figure: str, bounds: Sequence[Bound]) -> list[Bound]:
-    """How many cases of one kind keep their bounds, and then each one that does not."""
+    """Count of the cases of one kind that keep their bounds, followed by each broken bound."""
     held = sum(each.holds for each in bounds)
     whole = Bound(figure, f"{held:,} of {len(bounds):,}", "all", 0 < held == len(bounds))
     return [whole, *(each for each in bounds if not each.holds)]

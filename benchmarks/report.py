@@ -1,4 +1,4 @@
-"""What a benchmark gives back: figures by name, and the bounds that they were held against."""
+"""Result of a benchmark: figures by name, and their bounds."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -11,7 +11,7 @@ from benchmarks.bounds import Bound, faults_of, shown
 class Report:
     """Figures in the order in which they are shown, and their bounds.
 
-    `curves` are drawn rather than shown: values by name, one for each step of a run.
+    `curves` are drawn instead of shown: values by name, one for each step of a run.
     """
 
     name: str
@@ -21,16 +21,16 @@ class Report:
 
     @property
     def passed(self) -> bool:
-        """Whether there are bounds, and every figure is within its own."""
+        """True if there are bounds, and all figures are within them."""
         return bool(self.bounds) and not self.faults
 
     @property
     def faults(self) -> list[str]:
-        """The bounds that do not hold, in words."""
+        """Texts of the bounds that do not hold."""
         return faults_of(self.bounds)
 
     def text(self) -> str:
-        """The report as it is printed."""
+        """Printed text of the report."""
         lines = [f"{self.name}: {'within bounds' if self.passed else 'OUT OF BOUNDS'}"]
         lines += [f"  {name:<52} {shown(value)}" for name, value in self.figures.items()]
         lines += [

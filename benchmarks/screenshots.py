@@ -35,7 +35,7 @@ RUN = "sample-pass"
 BATCHES = 288
 START = "1999-03-01T00:00:00.000Z"
 CADENCE_S = 300.0
-"""288 batches are a day, the period that pages show first."""
+"""Seconds between batches: 288 batches are a day, the period that pages show first."""
 GYRO = GyroWanted(step_s=10.0)
 DAY = "start=1999-060T00:00:00Z&end=1999-061T00:00:00Z"
 NOTES = (
@@ -50,13 +50,13 @@ NOTES = (
 )
 SIZES = {"wide": 1440, "narrow": 400}
 TALLEST = {"wide": 1350, "narrow": 1100}
-"""Pixels of a picture's height: what follows on a long page is more of the same."""
+"""Greatest height of a screenshot in pixels; the rest of a long page is similar."""
 QUALITY = 50
 PATIENCE_S = 600.0
 
 
 def main() -> int:
-    """Fill a service, look at every page, write the pictures."""
+    """Record data in a service, open every page, and write the screenshots."""
     parser = argparse.ArgumentParser(
         prog="benchmarks.screenshots",
         description=__doc__,
@@ -81,7 +81,7 @@ def main() -> int:
 
 
 def filled(address: str, app: App) -> Mapping[str, str]:
-    """Replay a pass of every mission, act on its alarms; the pages that are worth a look."""
+    """Replay a pass of every mission and act on its alarms; returns the addresses of pages."""
     with httpx.Client(base_url=address, timeout=PATIENCE_S) as client:
         while client.get("/readyz").status_code != 200:
             time.sleep(0.2)
@@ -139,14 +139,14 @@ def filled(address: str, app: App) -> Mapping[str, str]:
 
 
 def looked_into(client: httpx.Client) -> str:
-    """A batch of XTE that was solved though a star of it was none of the catalog's."""
+    """Id of a solved XTE batch with a star that is not in the catalog."""
     asked = {"run": RUN, "spacecraft": "XTE", "outcome": "unmatched", "status": "good"}
     found = client.get("/api/v1/batches", params=asked).json()["items"]
     return str(max(found, key=lambda each: (each["counts"]["unique"], each["id"]))["id"])
 
 
 def taken(client: httpx.Client, app: App) -> str:
-    """A batch that was made from a frame."""
+    """Id of a batch made from a frame."""
     (drawn,) = draw_frames(load_missions()["IMAGER"], app.sky, FrameSettings(frames=1, seed=5))
     query = {k: v if isinstance(v, str) else json.dumps(v) for k, v in drawn.known.items()}
     answer = client.post(
@@ -159,14 +159,14 @@ def taken(client: httpx.Client, app: App) -> str:
 
 
 def calibrate(client: httpx.Client) -> None:
-    """Estimate the tracker of XTE from its sample pass."""
+    """Calibrate the tracker of XTE from its sample pass."""
     asked = {"spacecraft": "XTE", "run": RUN, "who": "J. Operator"}
     answer = client.post("/api/v1/calibrations", json=asked).raise_for_status()
     wait_while(client, answer.headers["Location"], ("queued", "running"))
 
 
 def replay(client: httpx.Client, lines: Sequence[Mapping[str, Any]], run: str = RUN) -> None:
-    """Send a file and wait until its last batch is recorded."""
+    """Replay a file of batches, and wait until the last one is recorded."""
     answer = client.post(
         "/api/v1/replays",
         params={"run": run, "alarms": run == RUN},
@@ -178,7 +178,7 @@ def replay(client: httpx.Client, lines: Sequence[Mapping[str, Any]], run: str = 
 
 
 def wait_while(client: httpx.Client, place: str, states: Sequence[str]) -> None:
-    """Wait until the replay or calibration there has left the states."""
+    """Wait until a replay or calibration has left the given states."""
     end = time.monotonic() + PATIENCE_S
     while client.get(place).json()["state"] in states:
         if time.monotonic() > end:
@@ -187,7 +187,7 @@ def wait_while(client: httpx.Client, place: str, states: Sequence[str]) -> None:
 
 
 def look(browser: Browser, address: str, pages: Mapping[str, str], folder: Path) -> int:
-    """Take every picture; bytes written."""
+    """Take all screenshots; returns the number of bytes written."""
     total = 0
     views = [(page, size, dark) for page in pages for size in SIZES for dark in (False, True)]
     for page, size, dark in tqdm(views, desc="pictures", unit="picture"):
@@ -206,7 +206,7 @@ def look(browser: Browser, address: str, pages: Mapping[str, str], folder: Path)
 
 
 def solve(browser: Browser) -> None:
-    """Choose a picture on the page of pictures, and wait for its stars."""
+    """Select a picture on the page of pictures, and wait for its stars."""
     root = browser.call("DOM.getDocument")["root"]["nodeId"]
     node = browser.call("DOM.querySelector", nodeId=root, selector="#file")["nodeId"]
     browser.call("DOM.setFileInputFiles", nodeId=node, files=[str(PICTURE)])
@@ -217,7 +217,7 @@ def solve(browser: Browser) -> None:
 TOP = """location.hash ? Math.round(
     document.querySelector(location.hash).closest("section").getBoundingClientRect().top + scrollY
 ) : 0"""
-"""A picture begins with the section that the address names."""
+"""Script for the top of a screenshot: the section that the address names."""
 SETTLED = """(() => {
   const charts = document.getElementById("charts");
   const connection = document.getElementById("connection");

@@ -1,8 +1,7 @@
-"""Sections of docs/verification.md: what a benchmark writes, and how the page keeps it.
+"""Sections of docs/verification.md: their content, and the comments that delimit them.
 
-A section stands between two comments.  The first tells its seed, its size,
-whether it is within its bounds and which code it was measured with, so that one
-section can be remade and the others kept as they are:
+A section is enclosed by two comments.  The first has the seed, the sample size, the verdict on the
+bounds and the measured code, so that one section can be remade and the others kept:
 
     <!-- section covariance; seed 7; full size; within bounds; commit ...; sources ...; ... -->
     ...
@@ -30,15 +29,15 @@ _KEPT = re.compile(
 _WITHIN, _OUT = "within bounds", "out of bounds"
 BOUNDS_HEAD = ("figure", "measured", "bound", "")
 MOST_ROWS = 6
-"""More bounds are shown by kind."""
+"""Number of bounds above which the table groups them by kind."""
 
 
 @dataclass(frozen=True)
 class Written:
-    """What a section says, in Markdown without its heading, and the bounds of its figures.
+    """Content of a section in Markdown without a heading, and the bounds of its figures.
 
-    `pictures` are SVG texts by file name; the page finds them in its folder `plots`.
-    `pages` are other Markdown pages by file name, which stand beside it.
+    `pictures` are SVG texts by file name, for the page's folder `plots`.  `pages` are further
+    Markdown pages by file name.
     """
 
     text: str
@@ -48,16 +47,15 @@ class Written:
 
     @property
     def passed(self) -> bool:
-        """Whether there are bounds, and every figure is within its own."""
+        """True if there are bounds, and all figures are within them."""
         return bool(self.bounds) and all(each.holds for each in self.bounds)
 
 
 @dataclass(frozen=True)
 class Section:
-    """A section of the page.  `write` is given whether samples are small, and the seed.
+    """Section of the page.  `write` takes whether samples are small, and the seed.
 
-    `sources` are the files and folders that its figures depend on, beside the
-    module of `write` itself.
+    `sources` are the files and folders, besides the module of `write`, on which the figures depend.
     """
 
     title: str
@@ -66,21 +64,21 @@ class Section:
 
     @property
     def all_sources(self) -> tuple[str, ...]:
-        """The sources with the module that measures."""
+        """All sources of the figures, including the module that measures them."""
         module = Path(inspect.getfile(self.write)).resolve()
         own = (str(module.relative_to(ROOT)),) if module.is_relative_to(ROOT) else ()
         return (*self.sources, *own)
 
 
 def pictures_of(salt: str, paint: Callable[[Folder], None]) -> dict[str, str]:
-    """What `paint` draws and saves, as SVG texts by file name."""
+    """Pictures that `paint` draws and saves, as SVG texts by file name."""
     with tempfile.TemporaryDirectory() as folder, pictures_in(Path(folder), salt) as pictures:
         paint(pictures)
         return {path.name: path.read_text(encoding="utf-8") for path in pictures.written}
 
 
 def framed(name: str, title: str, written: Written, quick: bool, seed: int, record: Record) -> str:
-    """A section made anew, between its comments."""
+    """Text of a new section between its comments."""
     size = "small samples" if quick else "full size"
     state = _WITHIN if written.passed else _OUT
     doubt = "" if written.passed else "**Some of these figures are out of bounds.**\n\n"
@@ -97,7 +95,7 @@ def framed(name: str, title: str, written: Written, quick: bool, seed: int, reco
 
 
 def _bounds(written: Written) -> str:
-    """All bounds; beside a table of figures their number, and those that do not hold."""
+    """Table of all bounds; next to a table of figures only their count and the broken ones."""
     if "\n| " not in written.text:
         return bounds_table(written.bounds)
     broken = [each for each in written.bounds if not each.holds]
@@ -105,10 +103,10 @@ def _bounds(written: Written) -> str:
 
 
 def bounds_table(bounds: Iterable[Bound]) -> str:
-    """The bounds in rows; those that do not hold are marked.
+    """Table of bounds, with marks on broken ones.
 
-    Of many bounds, those of one kind that hold make one row: the name behind the last colon
-    says the kind, and the smallest and the largest figure stand for all.
+    With many bounds, all intact ones of a kind share a row: the text after the last colon of the
+    name is the kind, and the row has the smallest and the greatest figure.
     """
     shown_bounds = list(bounds)
     rows = shown_bounds if len(shown_bounds) <= MOST_ROWS else _by_kind(shown_bounds)
@@ -139,25 +137,25 @@ def _by_kind(bounds: Iterable[Bound]) -> list[Bound]:
 
 
 def _leading(bound: Bound) -> float:
-    """The number with which a measured figure begins; zero for a figure in words."""
+    """Leading number of a measured figure; zero if there is none."""
     found = re.match(r"-?[\d,]*\.?\d+(e[+-]?\d+)?", bound.measured)
     return float(found[0].replace(",", "")) if found else 0.0
 
 
 def bounds_shown(text: str) -> int:
-    """How many bounds a section or a part of a page shows."""
+    """Number of bounds shown by a section or a part of a page."""
     head = table(BOUNDS_HEAD, [])
     _, found, rest = text.partition(head + "\n")
     return len(rest.partition("\n\n")[0].splitlines()) if found else 0
 
 
 def kept(page: str) -> dict[str, str]:
-    """The sections of a page by name, each between its comments."""
+    """Sections of a page by name, each with its comments."""
     return {match["name"]: match[0] for match in _KEPT.finditer(page)}
 
 
 def out_of_bounds(sections: Mapping[str, str]) -> list[str]:
-    """Names of the sections that say so of themselves."""
+    """Names of the sections marked as out of bounds."""
     return [
         name
         for name, text in sections.items()
@@ -166,19 +164,19 @@ def out_of_bounds(sections: Mapping[str, str]) -> list[str]:
 
 
 def state_of(text: str) -> tuple[str, Record | None] | None:
-    """What a section says of itself: its state and its record; None for another text."""
+    """State and record in the first comment of a section; None for other text."""
     match = _KEPT.match(text)
     return (match["state"], read_record(match["record"] or "")) if match else None
 
 
 def has_record(text: str) -> bool:
-    """Whether a section says which code it was measured with."""
+    """True if a section has a record of the measured code."""
     state = state_of(text)
     return state is not None and state[1] is not None
 
 
 def stale(sections: Mapping[str, str], known: Mapping[str, Section]) -> list[str]:
-    """The sections that were measured with other code than today's, or do not say with which."""
+    """Sections measured with other code than the present one, or without a record."""
     old = []
     for name, section in known.items():
         state = state_of(sections.get(name, ""))
@@ -191,16 +189,16 @@ def stale(sections: Mapping[str, str], known: Mapping[str, Section]) -> list[str
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[object]], numbers: int = 0) -> str:
-    """A Markdown table; the last `numbers` columns are set to the right."""
+    """Markdown table; the last `numbers` columns are aligned to the right."""
     rule = ["---"] * (len(head) - numbers) + ["---:"] * numbers
     lines = [head, rule, *([shown(cell) for cell in row] for row in rows)]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def tables_of(figures: Mapping[str, object]) -> str:
-    """Figures `label: kind` of which several labels have the same kinds as tables, then the others.
+    """Tables of figures `label: kind` for labels with equal kinds, followed by all other figures.
 
-    Others that follow each other with the same value share a row.
+    Consecutive other figures with equal values share a row.
     """
     kinds: dict[str, dict[str, object]] = {}
     for name, value in figures.items():
@@ -231,7 +229,7 @@ def _crossed(names: Sequence[str], labels: Mapping[str, Mapping[str, object]]) -
 
 
 def _joined(names: list[str]) -> str:
-    """One name for several: what they begin with, each one's own words, what they end with."""
+    """Joint name of several names: common beginning, differing words, common end."""
     split = [name.rpartition(": ") for name in names]
     labels = [label.split() or kind.split() for label, _, kind in split]
     same = takewhile(lambda words: len(set(words)) == 1, zip(*labels, strict=False))

@@ -1,4 +1,4 @@
-"""Makes the dictionary that answers and batches are compressed with.
+"""Trains the dictionary for the compression of answers and batches.
 
     python -m benchmarks.train_dictionary [--seed S] FILE
 
@@ -28,7 +28,7 @@ BATCHES, BYTES = 400, 8192
 
 
 def texts(seed: int) -> tuple[list[bytes], list[bytes]]:
-    """Answers, and the batches as they are recorded, in random order."""
+    """Answers, and batches as recorded, in random order."""
     missions, sky = load_missions(), SkyModel(load_embedded(), LruCache(256 << 20))
     solver = Solver(missions, sky)
     answers, batches = [], []

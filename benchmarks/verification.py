@@ -61,14 +61,14 @@ SECTIONS: Mapping[str, Section] = {
     "centroids": centroids.SECTION,
     "ptp": ptp.SECTION,
 }
-"""In the order of the page."""
+"""Sections in the order of the page."""
 
 TARGET = ROOT / "docs" / "verification.md"
 DEFAULT_SEED = 19941026
 
 
 def page(sections: Mapping[str, str]) -> str:
-    """The page of sections already framed, in the order of `SECTIONS`."""
+    """Page of the given sections, in the order of `SECTIONS`."""
     doubtful = out_of_bounds(sections)
     verdict = (
         f"**Out of bounds: {', '.join(doubtful)}.**"
@@ -101,7 +101,7 @@ count of random events, its bound is one that chance alone passes once in 10,000
 
 
 def remake(names: Sequence[str], quick: bool, seed: int, output: Path) -> bool:
-    """Make these sections of the page anew, keep the others; whether all are within bounds."""
+    """Make the named sections anew, keep the others; true if all are within bounds."""
     sections: dict[str, str] = {}
     for name in names:
         # Before the measurement, which takes minutes: the code may be edited meanwhile.

@@ -1,1 +1,1 @@
-"""The same inputs through two versions of the service, and every difference: see `__main__`."""
+"""Comparison of two versions of the service by sending both the same requests (`__main__`)."""

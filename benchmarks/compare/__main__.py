@@ -64,19 +64,19 @@ from benchmarks.compare.servers import (
 DEFAULT_INPUTS = 2000
 DEFAULT_SEED = 19941026
 MOST_SHOWN = 5
-"""Of the differences of one request."""
+"""Greatest number of differences shown of one request."""
 MOST_REQUESTS_SHOWN = 5
-"""Of one kind; the others are in their files."""
+"""Greatest number of requests shown of one kind; files hold the others."""
 POLL_S = 0.1
 NO_ANSWER = 0
-"""In place of the status, where a server did not answer.  It counts as a difference in any case."""
+"""Status of a request that a server did not answer; it always counts as a difference."""
 REPLAY_S = 300.0
 _REFERENCE = re.compile(r"\{([\w-]+):([\w.]+)\}")
 UNKNOWN_ID = "01JD0000000000000000000000"
 
 
 class Server:
-    """One version that answers; keeps what later requests refer to."""
+    """Server of one version; keeps the answers to which later requests refer."""
 
     def __init__(self, client: httpx.Client) -> None:
         self._client = client
@@ -84,7 +84,7 @@ class Server:
         self._answers: dict[str, Any] = {}
 
     def ask(self, request: Request) -> tuple[Received, str]:
-        """The answer, and the address that was asked."""
+        """Send a request; returns the answer and the requested address."""
         path = _REFERENCE.sub(self._referred, request.path)
         deadline = time.monotonic() + REPLAY_S
         while True:
@@ -106,7 +106,7 @@ class Server:
         return self._plain.answer(received, request.name, cached_counts)
 
     def _referred(self, found: re.Match[str]) -> str:
-        """What an earlier answer holds; an id that nothing has, where it holds nothing such."""
+        """Value in an earlier answer; an unknown id if that answer has no such value."""
         value: Any = self._answers.get(found[1])
         for part in found[2].split("."):
             try:
@@ -122,7 +122,7 @@ def _runs(received: Received) -> bool:
 
 @dataclass
 class Outcome:
-    """What came of one request: the statuses, and where the answers differ."""
+    """Outcome of one request: statuses, and differences of the answers."""
 
     request: Request
     paths: tuple[str, str]
@@ -132,7 +132,7 @@ class Outcome:
 
 @dataclass
 class Tally:
-    """Everything that was compared."""
+    """Results of all comparisons."""
 
     folder: Path
     allow_additions: bool
@@ -159,7 +159,7 @@ class Tally:
                 tqdm.write(line)
 
     def _keep(self, outcome: Outcome, found: Sequence[Difference]) -> Path:
-        """Write what is needed to ask again."""
+        """Write a file with all data needed to repeat a request."""
         request = outcome.request
         file = self.folder / f"{request.name}.json"
         sent: dict[str, Any] = {
@@ -183,7 +183,7 @@ class Tally:
         return file.relative_to(HERE) if file.is_relative_to(HERE) else file
 
     def table(self) -> str:
-        """A line for each kind of request."""
+        """Table of results with a line for each kind of request."""
         width = max(len(kind) for kind in self.counts)
         lines = [f"{'kind':{width}}  requests  different  statuses"]
         for kind, count in self.counts.items():
@@ -210,7 +210,7 @@ def _short(value: Any, most: int = 120) -> str:
 
 
 def compare_phase(phase: Phase, servers: Sequence[Server], add: Callable[[Outcome], None]) -> None:
-    """Send every request of a phase to both servers; both work at the same time."""
+    """Send every request of a phase to both servers at the same time."""
     cached_counts = phase.at_once == 1
 
     def ask(server: Server, step: Callable[[], object]) -> list[tuple[Received, str]]:
@@ -239,7 +239,7 @@ def compare_phase(phase: Phase, servers: Sequence[Server], add: Callable[[Outcom
 
 
 def compare_interfaces(base: Path, allow_additions: bool) -> bool:
-    """Print where `openapi.yaml` differs; whether that is permitted."""
+    """Print the differences of `openapi.yaml`; true if all are permitted."""
     documents = [
         yaml.load((tree / "openapi.yaml").read_text(encoding="utf-8"), Loader=yaml.CSafeLoader)
         for tree in (base, HERE)

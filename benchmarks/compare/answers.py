@@ -1,8 +1,7 @@
-"""What of two answers must be equal, and where they differ.
+"""Comparison of two answers without the parts that may differ.
 
-An answer is first written in a form that does not hold what may differ between
-two equal runs (`Plain`); two such forms are then compared value by value
-(`differences`).
+`Plain` writes an answer without the parts that may differ between two equal runs; `differences`
+then compares two such forms value by value.
 """
 
 import csv
@@ -15,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 DURATIONS = frozenset({"timings_us", "us_per_batch", "build_us", "received_age_s"})
-"""Fields that hold how long something took; of an object, all that is in it."""
+"""Names of fields with durations; everything in an object of such a name is left out."""
 STAMPS = frozenset(
     {
         "at",
@@ -31,32 +30,32 @@ STAMPS = frozenset(
         "until",
     }
 )
-"""Fields that hold times of the service's own clock.  Times of batches are compared."""
+"""Names of fields with times of the service's own clock; times of batches are compared."""
 CURSORS = frozenset({"next_cursor"})
 PROBLEM_TYPE = "application/problem+json"
 HEADERS = ("content-type", "replayed", "thinned", "location", "link", "allow", "retry-after")
-"""Of the others a server may send what it likes."""
+"""Names of the compared headers; a server may send any others."""
 PRESENT_ONLY = frozenset({"link", "retry-after"})
-"""Headers that hold a cursor or a number of seconds: it is compared whether they are there."""
+"""Headers with a cursor or a number of seconds, compared by presence only."""
 _ULID = re.compile(r"(?<![0-9A-Za-z])[0-7][0-9A-HJKMNP-TV-Z]{25}(?![0-9A-Za-z])")
 _METRIC = re.compile(r"^([a-zA-Z_:][\w:]*)(?:\{(.*)\})? (\S+)$", re.MULTILINE)
 _LABEL = re.compile(r'(\w+)="')
 COUNTED_METRICS = ("starid_stars_total", "starid_batches_total")
-"""Counters of answers.  Of every other metric the name and the names of its labels are compared."""
+"""Counters of answers, compared by value; other metrics by their names and labels."""
 
 
 @dataclass
 class Names:
-    """Names for the ids of one server, by the request in whose answer each was first seen.
+    """Names that replace the ids of one server, by the request whose answer first had the id.
 
-    Two servers that were sent the same requests give the same names, so that a
-    reference to a wrong record is found although the ids themselves differ.
+    Two servers with the same requests give the same names.  So a reference to a wrong record is
+    found although the ids themselves differ.
     """
 
     known: dict[str, str] = field(default_factory=dict)
 
     def named(self, text: str, request: str) -> str:
-        """The text with a name in place of each id."""
+        """Replace each id in a text by its name."""
 
         def name(found: re.Match[str]) -> str:
             new = f"<id {len(self.known)} of {request}>"
@@ -73,7 +72,7 @@ class Names:
 
 @dataclass(frozen=True)
 class Received:
-    """What a server answered."""
+    """Answer received from a server."""
 
     status: int
     headers: Mapping[str, str]
@@ -82,16 +81,16 @@ class Received:
 
 @dataclass(frozen=True)
 class Plain:
-    """Writes answers without what may differ; `names` are those of one server.
+    """Writes answers without the parts that may differ; `names` belongs to one server.
 
-    `cached_counts`: whether it is compared if a zone came from the cache.  It
-    depends on the order of the requests, and so differs where they overlap.
+    `cached_counts`: whether the answers are compared for zones from the cache.  That depends on the
+    order of the requests, and so differs if they overlap.
     """
 
     names: Names
 
     def answer(self, received: Received, request: str, cached_counts: bool = True) -> Any:
-        """Status, headers and body."""
+        """Comparable form of status, headers and body."""
         headers = {
             name: "<present>" if name in PRESENT_ONLY else self.names.named(value, request)
             for name in HEADERS
@@ -117,7 +116,7 @@ class Plain:
         return f"sha256 {hashlib.sha256(received.body).hexdigest()}" if received.body else None
 
     def value(self, value: Any, request: str, cached_counts: bool = True, key: str = "") -> Any:
-        """A JSON value; `key` is the field that it stands in."""
+        """Comparable form of a JSON value; `key` is the name of its field."""
         if key in DURATIONS:
             return _durations(value)
         if key in STAMPS and isinstance(value, str):
@@ -144,7 +143,7 @@ class Plain:
 
 
 def problem(content: Mapping[str, Any]) -> dict[str, Any]:
-    """What counts of a problem: status, type, and which fields are at fault."""
+    """Compared parts of a problem answer: status, type, and names of the faulty fields."""
     return {
         **{name: content[name] for name in ("status", "type") if name in content},
         "fields": [each.get("field") for each in content.get("errors", [])],
@@ -152,7 +151,7 @@ def problem(content: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def metrics(text: str) -> Any:
-    """Of metrics their names and labels, and the counters of answers; any other text as it is."""
+    """Names and labels of metrics, with the values of answer counters; other text unchanged."""
     found = _METRIC.findall(text)
     if not found:
         return text.strip()
@@ -169,7 +168,7 @@ MEAN_DIGITS = 10
 
 
 def _rounded(value: Any) -> Any:
-    """Means rounded: batches that overlap are summed in another order, with other last digits."""
+    """Rounded means: sums of overlapping batches differ in order, and so in last digits."""
     if isinstance(value, list):
         return [_rounded(each) for each in value]
     if isinstance(value, str) and value:
@@ -191,7 +190,7 @@ MISSING = "<missing>"
 
 @dataclass(frozen=True)
 class Difference:
-    """A place in an answer, as `body.counts.unique`, and what stands there in each."""
+    """Difference of two answers: a path such as `body.counts.unique`, and both values."""
 
     path: str
     base: Any
@@ -199,12 +198,12 @@ class Difference:
 
     @property
     def is_addition(self) -> bool:
-        """Whether the base has nothing there."""
+        """True if the base has no value at the path."""
         return self.base is MISSING
 
 
 def differences(base: Any, here: Any, path: str = "") -> Iterator[Difference]:
-    """Every difference of two values; an int and a float of the same value differ."""
+    """All differences of two values; an int and a float of the same value differ."""
     if isinstance(base, dict) and isinstance(here, dict):
         for name in [*base, *(each for each in here if each not in base)]:
             yield from differences(

@@ -1,7 +1,7 @@
-"""What both versions are asked: requests of every kind, drawn with a seed.
+"""Requests of every kind for both versions, drawn with a seed.
 
-A request may name what an earlier one was answered: `{first:id}` in its path is
-the field `id` of the answer to the request `first`, of the same server.
+A request may refer to an earlier answer of the same server: `{first:id}` in its path is the field
+`id` of the answer to the request `first`.
 """
 
 import gzip
@@ -27,7 +27,7 @@ API = "/api/v1"
 IDENTIFIERS = ("verified", "starid", "ptp", "lost_in_space")
 PRIORS: tuple[PriorKind, PriorKind, Literal["none"]] = ("quaternion", "direction", "none")
 TWIN = "TWIN"
-"""A mission with two trackers, made for this: the shipped ones have one each."""
+"""Name of a generated mission with two trackers; the shipped missions have one each."""
 MISSIONS = ("XTE", "SWAS", "SOHO", "IMAGER", TWIN)
 YEARS = (1999, 2026)
 JSON = {"Content-Type": "application/json"}
@@ -36,9 +36,9 @@ Json = dict[str, Any]
 
 @dataclass(frozen=True)
 class Request:
-    """One request; `name` is its own, `kind` is the row of the table that it counts in.
+    """Request with its own `name`, and its `kind`, the row of the table that counts it.
 
-    `until_ended`: it is repeated until the answer's `state` is not `running`.
+    `until_ended`: the request is repeated until the answer's `state` is not `running`.
     """
 
     kind: str
@@ -52,7 +52,7 @@ class Request:
 
 @dataclass(frozen=True)
 class Phase:
-    """Requests that are sent one after another, or `at_once` of them overlapping."""
+    """Requests sent one after another, or `at_once` of them overlapping."""
 
     title: str
     requests: Sequence[Request]
@@ -62,7 +62,8 @@ class Phase:
 def write_twin(folder: Path, tree: Path) -> None:
     """Write the mission file of `TWIN`: the XTE of a checkout, with a second tracker.
 
-    `tree` is the older checkout of those that read it: what may be left out later is given in it.
+    `tree` is the older checkout of the two that read the file, so settings that a later version
+    made optional are included.
     """
     text = (tree / "service/missions/xte.toml").read_text(encoding="utf-8")
     text = text.replace('name = "XTE"', f'name = "{TWIN}"')
@@ -83,7 +84,7 @@ def write_twin(folder: Path, tree: Path) -> None:
 
 
 def phases_of(inputs: int, seed: int, folder: Path) -> list[Phase]:
-    """About `inputs` requests that compute or change something, and those that read it all.
+    """About `inputs` requests that compute or change something, and requests to read the results.
 
     `folder` holds the mission file of `TWIN`.
     """
@@ -106,7 +107,7 @@ def phases_of(inputs: int, seed: int, folder: Path) -> list[Phase]:
 
 
 class _Draw:
-    """Draws everything from one seed."""
+    """Draws all requests from one seed."""
 
     def __init__(self, seed: int, folder: Path) -> None:
         self._seed = seed
@@ -116,7 +117,7 @@ class _Draw:
         self._passes = 0
 
     def _pass(self, mission: str, batches: int, **wanted: Any) -> Iterator[Json]:
-        """Batches of a pass; each pass of a spacecraft is on days of its own."""
+        """Batches of a pass; each pass of a spacecraft is on other days."""
         self._passes += 1
         trouble, day, month = 0.12, 1 + self._passes // 12, 1 + self._passes % 12
         settings: Json = {
@@ -135,7 +136,7 @@ class _Draw:
             yield each.batch
 
     def batches(self, count: int) -> list[Request]:
-        """Every mission, identifier and kind of a priori knowledge, with options of all kinds."""
+        """Batch requests for all missions, identifiers, a priori kinds and options."""
         rng = self._rng
         most = -(-count // len(MISSIONS))
         passes = {
@@ -165,7 +166,7 @@ class _Draw:
         return found
 
     def _fields(self, mission: str, most: int, prior: PriorKind) -> Iterator[Json]:
-        """Fields of few stars and of many, in turn."""
+        """Batches with fields of few stars and of many, alternating."""
         few = self._pass(mission, most, prior=prior)
         many = self._pass(mission, most, prior=prior, stars=25)
         while True:
@@ -174,7 +175,7 @@ class _Draw:
             yield next(many)
 
     def _vary(self, body: Json) -> None:
-        """Change some of what a batch may hold, and its options."""
+        """Randomly change optional parts of a batch, and its options."""
         rng = self._rng
         stars = [star for each in body["observations"] for star in each["stars"]]
         options: Json = {}
@@ -215,7 +216,7 @@ class _Draw:
                 each["stars"] = each["stars"][:1]
 
     def overlapping(self, count: int) -> list[Request]:
-        """Batches of a run of their own, whose answers must not depend on their order."""
+        """Batches of a separate run, whose answers must not depend on their order."""
         found = []
         passes = {name: self._pass(name, count) for name in ("XTE", "SOHO")}
         for k in range(count):
@@ -225,7 +226,7 @@ class _Draw:
         return found
 
     def bad_input(self, count: int) -> list[Request]:
-        """Each known fault, then bytes changed by chance."""
+        """Faulty batch requests: each known fault, then random changes of bytes."""
         good = next(self._pass("XTE", 1))
         found = [
             *(
@@ -243,7 +244,7 @@ class _Draw:
         return found
 
     def frames(self, count: int) -> list[Request]:
-        """Frames of every format and image of a point, good and bad, and pictures of them."""
+        """Frame requests: every format and point spread, good and bad; and pictures of frames."""
         mission = self._missions["IMAGER"]
         path = f"{API}/spacecraft/IMAGER/frames"
         formats: tuple[FrameFormat, ...] = ("fits", "tiff", "png", "npy")
@@ -297,7 +298,7 @@ class _Draw:
         ]
 
     def what_ifs(self, batches: Sequence[Request], count: int) -> list[Request]:
-        """Recorded batches with other options: looked at, recorded, adopted, refused."""
+        """Requests with other options for recorded batches: shown, recorded, adopted, refused."""
         rng, found = self._rng, []
         for k in range(count):
             one = batches[int(rng.integers(len(batches)))]
@@ -322,7 +323,7 @@ class _Draw:
         ]
 
     def replays(self, count: int) -> list[Request]:
-        """A file of lines, some of them bad; the same again; a packed one; a damaged one."""
+        """Replay requests: a file with some bad lines, a repeat, a compressed and a broken file."""
         lines = []
         for k, body in enumerate(self._pass("SWAS", count)):
             if k % 17 == 11:
@@ -354,7 +355,7 @@ class _Draw:
         ]
 
     def alarms(self) -> list[Request]:
-        """Limits that are changed, alarms that are raised by a watched run, and acted upon."""
+        """Alarm requests: changed limits, alarms of a watched run, and actions on them."""
         limit = f"{API}/spacecraft/SWAS/limits/no_attitude_share"
         who = {"who": "J. Operator", "comment": "compared"}
         settings = {"warning": {"high": 0.5}, "minimum_count": 2, "duration_s": 0}
@@ -397,7 +398,7 @@ class _Draw:
         ]
 
     def zones(self) -> list[Request]:
-        """Zones that are built ahead and dropped."""
+        """Zone requests: zones built in advance, and dropped."""
         body = next(self._pass("XTE", 1))
         asked = {"spacecraft": "XTE", "time": body["time"], "a_priori": [body["a_priori"]]}
         path = f"{API}/zones"
@@ -411,7 +412,7 @@ class _Draw:
 
 
 def faulty_batches(good: Json) -> Iterator[tuple[str, Any]]:
-    """Each fault that a field may have."""
+    """Faulty versions of a batch: one for each fault of a field."""
     star = good["observations"][0]["stars"][0]
     tracker = good["observations"][0]
     for name in ("spacecraft", "batch", "time", "a_priori", "observations"):
@@ -534,7 +535,7 @@ def _bad_addresses() -> Iterator[Request]:
 
 
 def _mutated(text: bytes, rng: np.random.Generator) -> bytes:
-    """The text with one to three places changed."""
+    """Text with random changes at one to three places."""
     changed = bytearray(text)
     tokens = (b'"', b",", b"{", b"}", b"[", b"]", b"null", b"true", b"1e999", b"-", b"\\ud800")
     for _ in range(int(rng.integers(1, 4))):
@@ -553,7 +554,7 @@ def _mutated(text: bytes, rng: np.random.Generator) -> bytes:
 
 
 def _repeats(batches: Sequence[Request], count: int) -> Iterator[Request]:
-    """The same again, another body under the same id, and keys."""
+    """Repeated batches, other bodies under the same id, and requests with idempotency keys."""
     for k, one in enumerate(batches[:: max(1, len(batches) // max(count // 3, 1))]):
         yield Request("repeat", f"repeat-{k}", "POST", one.path, one.content, JSON)
         other = json.loads(one.content) | {
@@ -592,7 +593,7 @@ RUNS = ("live", "overlapping", "replayed", "watched", "nothing-here")
 
 
 def reads(batches: Sequence[Request]) -> list[Request]:
-    """Every read route, over everything that was recorded, and the console's pages."""
+    """Requests of all read routes for all recorded data, and of the console's pages."""
     paths: list[tuple[str, str]] = []
     for run in RUNS:
         paths += [

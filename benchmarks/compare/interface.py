@@ -1,4 +1,4 @@
-"""Where two descriptions of the interface (`openapi.yaml`) differ in what a client relies on.
+"""Differences of two interface descriptions (`openapi.yaml`) that a client can notice.
 
 Descriptions, summaries, titles and examples may differ.  Everything else is
 compared: paths, methods, operationIds, components, properties, types, required
@@ -31,7 +31,7 @@ NAMED = frozenset(
         "parameters",
     }
 )
-"""Fields whose keys are names that somebody chose, and not fields of the format."""
+"""Fields of the format whose keys are freely chosen names."""
 VERBATIM = frozenset({"default", "const"})
 UNORDERED = frozenset({"required", "enum", "type"})
 METHODS = frozenset({"get", "put", "post", "delete", "patch", "head", "options", "trace"})
@@ -39,7 +39,7 @@ _SCHEMAS = "#/components/schemas/"
 
 
 def normalised(document: Mapping[str, Any]) -> dict[str, Any]:
-    """The description without prose; lists without an order as mappings from their members."""
+    """Description without prose; unordered lists become mappings from their members."""
     shown: dict[str, Any] = _normalised(document)
     shown.get("info", {}).pop("version", None)
     return shown
@@ -70,13 +70,13 @@ def _name_of(entry: Mapping[str, Any]) -> str:
 
 
 def interface_differences(base: Mapping[str, Any], here: Mapping[str, Any]) -> list[Difference]:
-    """Every difference that a client may notice; see `is_addition`."""
+    """All differences that a client can notice; see `is_addition`."""
     one, other = normalised(base), normalised(here)
     return list(_differences(one, other, _Place((), False, _asked_of_clients(other))))
 
 
 def _asked_of_clients(document: Mapping[str, Any]) -> frozenset[str]:
-    """The components that requests are made of, however deep."""
+    """Names of the components that requests contain, at any depth."""
     schemas = document.get("components", {}).get("schemas", {})
     found: set[str] = set()
     ahead = [
@@ -106,15 +106,15 @@ def _references(value: Any) -> Iterator[str]:
 
 
 NOTHING = "<nothing>"
-"""Stands for the base where a description says more without being an addition: a new bound."""
+"""Placeholder for a missing base value if a new entry is no addition, such as a new limit."""
 _GROWING = frozenset({"enum", "tags"})
 
 
 @dataclass(frozen=True)
 class _Place:
-    """Where a value stands; `named`: the keys of the mapping there are names.
+    """Position in the description; `named`: the keys of the mapping at it are names.
 
-    `asked` are the components that requests are made of.
+    `asked` names the components that requests contain.
     """
 
     path: tuple[str, ...]
@@ -127,7 +127,7 @@ class _Place:
 
     @property
     def is_request(self) -> bool:
-        """Whether clients must send what stands here."""
+        """True if clients must send the value at this position."""
         component = self.path[2] if self.path[:2] == ("components", "schemas") else None
         return component in self.asked or "requestBody" in self.path
 
@@ -135,7 +135,7 @@ class _Place:
         return _Place((*self.path, name), name in NAMED and not self.named, self.asked)
 
     def adds(self, name: str, value: Any) -> bool:
-        """Whether a new entry asks nothing of the clients that there are."""
+        """True if existing clients need no change for a new entry."""
         if self.path[-1:] == ("parameters",):
             return not (isinstance(value, Mapping) and value.get("required"))
         if len(self.path) == 2 and self.path[0] == "paths":
@@ -165,7 +165,7 @@ def _differences(base: Any, here: Any, place: _Place) -> Iterator[Difference]:
 
 
 def _of_earlier_properties(base: Mapping[str, Any], here: Mapping[str, Any]) -> Any:
-    """What is required, without properties that are new: answers may have more fields."""
+    """Required properties without new ones: answers may have more fields."""
     if not isinstance(here["required"], Mapping):
         return here["required"]
     new = set(here.get("properties", {})) - set(base.get("properties", {}))

@@ -1,4 +1,4 @@
-"""Two versions of the service, each served from its own tree over a database of its own."""
+"""Servers of two versions, each from its own source tree and with its own database."""
 
 import io
 import os
@@ -16,17 +16,17 @@ from pathlib import Path
 import httpx
 
 HERE = Path(__file__).resolve().parents[2]
-"""This tree."""
+"""Root folder of the present source tree."""
 KEPT = HERE / ".compare"
-"""Other versions by commit, with the kernels that were compiled for them, and reports."""
+"""Folder of reports and of other versions by commit, with their compiled kernels."""
 START_S = 300.0
 STOP_S = 60.0
 ANSWER_S = 300.0
-"""Long enough on a machine that does much else."""
+"""Time limit in seconds of an answer, enough for a busy machine."""
 
 
 def commit_of(name: str) -> str:
-    """The full name of a commit; raises `SystemExit` where there is none."""
+    """Full id of a commit; raises `SystemExit` if it does not exist."""
     command = ["git", "rev-parse", "--verify", "--quiet", f"{name}^{{commit}}"]
     found = subprocess.run(command, cwd=HERE, capture_output=True, text=True, check=False)
     if found.returncode:
@@ -35,7 +35,7 @@ def commit_of(name: str) -> str:
 
 
 def checked_out(commit: str) -> Path:
-    """The tree of a commit, under `KEPT`; what is there already is used again."""
+    """Source tree of a commit under `KEPT`; an existing one is used again."""
     tree = KEPT / commit
     if not tree.is_dir():
         partial = KEPT / f"{commit}.partial"
@@ -51,7 +51,7 @@ def checked_out(commit: str) -> Path:
 
 
 def compile_kernels(tree: Path) -> None:
-    """Compile what the first requests would wait for: minutes, or seconds when it was done."""
+    """Compile the kernels of a source tree: minutes the first time, seconds later."""
     command = ["service.cli", "prepare"]
     if not (tree / "service" / "sky" / "files.py").exists():
         command = ["service.acquire.prewarm"]  # as it was called before
@@ -60,7 +60,7 @@ def compile_kernels(tree: Path) -> None:
 
 @contextmanager
 def served(tree: Path, folder: Path, missions: Path) -> Iterator[httpx.Client]:
-    """`acquire serve` of a tree over a new database in `folder`; a client that talks to it."""
+    """Client of `acquire serve` from a source tree, with a new database in `folder`."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     command = [sys.executable, "-m", "service.cli", "serve", "--port", str(port)]
@@ -91,9 +91,9 @@ def served(tree: Path, folder: Path, missions: Path) -> Iterator[httpx.Client]:
 
 
 def _environment(**more: str) -> dict[str, str]:
-    """This process's own, without settings of the service and without other places of modules.
+    """Environment of this process without settings of the service, module paths and kernel folder.
 
-    Nor of kernels: each version has its own.
+    Each version has its own kernels.
     """
     kept = {
         name: value

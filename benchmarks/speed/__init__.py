@@ -1,1 +1,1 @@
-"""What the service and its kernels cost: docs/performance.md."""
+"""Benchmarks of the speed of the service and its kernels: docs/performance.md."""

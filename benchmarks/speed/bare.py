@@ -1,9 +1,8 @@
-"""Bare kernels: the same work as the service's, and nothing else.
+"""Bare kernels: the work of the service's kernels without settings.
 
-Arrays are ready and of one type, every array that is written to is given, no
-test can be switched off, no option is looked at, no reference is counted.  What
-the service's kernels take beyond this is what settings, exact zones on a grid
-and warnings cost.
+Arrays are ready and of one type, all output arrays are given, no test can be switched off, there
+are no options and no reference counts.  The service's kernels take longer for settings, exact zones
+on a grid, and warnings.
 """
 
 import math
@@ -17,7 +16,7 @@ from service.vectors import Matrix, Vector
 
 Integers = npt.NDArray[np.int32]
 Arrays = tuple[Any, ...]
-"""Of several types, in the order in which the first line of a kernel unpacks them."""
+"""Arrays of several types, in the order in which the first line of a kernel unpacks them."""
 
 
 @njit_no_refcount
@@ -48,7 +47,7 @@ def bare_votes(
     touched: Integers,  # room for the zone stars that got votes
     star: npt.NDArray[np.int64],  # (n,) the winner's zone row, -1 without one
 ) -> None:
-    """Steps 1 to 10 for five stars or so, and the unique winners."""
+    """Count the votes of steps 1 to 10 for about five stars, and their unique winners."""
     tolerance, mag_tolerance, order_tolerance, cross, pole_1, pole_2 = settings
     n = len(observed)
     count = 0
@@ -135,7 +134,7 @@ def bare_votes(
 def bare_attitude(
     b: Vector, r: Vector, weight: Vector, turned: Vector, matrix: Matrix, q: Vector
 ) -> None:
-    """TRIAD of the widest pair into `matrix`; from it the turn for QUEST, whose answer is q."""
+    """TRIAD of the widest pair into `matrix`, then QUEST in its frame with the result `q`."""
     n = len(b)
     one, two, widest = 0, 1, -1.0
     for i in range(n - 1):
@@ -250,7 +249,7 @@ def bare_one(
     star: npt.NDArray[np.int64],
     q: Vector,
 ) -> bool:
-    """One batch: votes, and the attitude of those that are named; whether there is one."""
+    """Identify one batch and solve its attitude; true if there is an attitude."""
     direction, magnitude, separation, brighter, dimmer, bin_start, bins_per_rad = zone
     votes, touched, b, r, w, turned, matrix = room
     bare_votes(
@@ -299,7 +298,7 @@ def bare_many(
     star: npt.NDArray[np.int64],
     q: Vector,
 ) -> None:
-    """Many batches of one zone, one after another."""
+    """Process many batches of one zone, one after another."""
     for k in range(len(observed)):
         bare_one(
             observed[k],
@@ -318,7 +317,7 @@ def bare_many(
 
 
 def room_for(n: int, stars: int, pairs: int) -> Arrays:
-    """The arrays that the bare kernels write to."""
+    """Output arrays of the bare kernels."""
     return (
         np.zeros((n, stars), np.int32),
         np.empty(n * n * max(pairs, 1) + 2, np.int32),

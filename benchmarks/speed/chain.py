@@ -45,7 +45,7 @@ def _seconds(call: Callable[[], object]) -> float:
 
 
 def _bytes(file: Path) -> int:
-    """The bytes that the chain's tables add to a file without free pages."""
+    """Bytes that the tables of the hash chain add to a database file without free pages."""
     sizes = []
     for without in (False, True):
         copy = file.with_name(f"without-{without}.db")
@@ -59,7 +59,7 @@ def _bytes(file: Path) -> int:
 
 
 def run(quick: bool, seed: int) -> Report:
-    """The benchmark."""
+    """Benchmark of the hash chain."""
     count = QUICK_POSTS if quick else POSTS
     made = telemetry(seed)
     with tempfile.TemporaryDirectory() as folder:

@@ -1,4 +1,4 @@
-"""Many batches by columns beside the same batches one by one, in one run, with equal answers.
+"""Many batches as columns against the same batches one by one, in one run, with equal answers.
 
     python -m benchmarks columns
 
@@ -39,7 +39,7 @@ MOST_ONE_US = {"XTE": 150.0, "SOHO": 220.0}
 
 
 def run(quick: bool, seed: int) -> Report:
-    """The benchmark: a cap and a band."""
+    """Benchmark of columns with a cap and with a band."""
     sky = SkyModel(load_embedded(), LruCache(MEGABYTES_256))
     figures: dict[str, Any] = {}
     bounds: list[Bound] = []
@@ -54,7 +54,7 @@ def run(quick: bool, seed: int) -> Report:
 def measured(
     name: str, drawn: list[ObservationBatch], sky: SkyModel
 ) -> tuple[dict[str, Any], list[Bound]]:
-    """The figures and bounds of one mission."""
+    """Figures and bounds of one mission."""
     mission = load_missions()[name]
     columns, few = BatchColumns.of(drawn), drawn[: len(drawn) // 10]
     found = acquire_many(columns, mission, sky)
@@ -101,7 +101,7 @@ def measured(
 
 
 def nominal(name: str, count: int, seed: int, sky: SkyModel) -> list[ObservationBatch]:
-    """Batches of five real stars about one a priori attitude that is a little off."""
+    """Batches of five real stars about one slightly wrong a priori attitude."""
     toml = tomllib.loads((SHIPPED_FOLDER / f"{name.lower()}.toml").read_text("utf-8"))
     judge, rng, moment = Judge(toml, sky), np.random.default_rng(seed), batches.TIMES[1]
     attitude = batches.prior_attitudes(rng, toml, 3)[2]
@@ -123,7 +123,7 @@ def nominal(name: str, count: int, seed: int, sky: SkyModel) -> list[Observation
 
 
 def _answer(acquisition: Acquisition) -> bytes:
-    """The answer without what tells of the moment."""
+    """Answer as JSON bytes without times and cache state."""
     answer = msgspec.to_builtins(answer_of(acquisition, id=None))
     del answer["timings_us"]
     for each in answer["observations"]:

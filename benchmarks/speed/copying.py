@@ -25,11 +25,11 @@ from benchmarks.speed.scale import SPACECRAFT, emptied, filled, same
 BATCHES, EVERY_S = 525_600, 60.0
 EXPORTED = ("batches", "stars", "attitude")
 MOST_MB = 350.0
-"""Memory of each command, however long the record is."""
+"""Greatest memory of each command in MB, independent of the length of the record."""
 
 
 def measured(record: Path, postgresql: str, folder: Path) -> Report:
-    """Copy a record there and back, verify both, and export from all three."""
+    """Copy a record to PostgreSQL and back, verify both copies, and export from all three."""
     urls = {
         "SQLite": f"sqlite:///{record}",
         "PostgreSQL": postgresql,
@@ -69,7 +69,7 @@ def measured(record: Path, postgresql: str, folder: Path) -> Report:
 
 
 def main() -> int:
-    """Record, copy and print; 1 where a figure is out of bounds."""
+    """Command that records, copies and prints; returns 1 if a figure is out of bounds."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -1,4 +1,4 @@
-"""How fast files are written, beside the programs that write the same.
+"""Speed of file output, compared with other programs that write the same files.
 
     python -m benchmarks exports           a day at 1 Hz as text; 1,000,000 batches as Parquet
     python -m benchmarks exports --quick   an hour; 20,000 batches
@@ -40,7 +40,7 @@ BATCHES, QUICK_BATCHES = 1_000_000, 20_000
 PAGE = 2_000
 ROUNDS, QUICK_ROUNDS = 3, 1
 TEXTS, MOST_OF_BRAHE = ("aem", "aem-xml", "acm", "csv", "json"), 3.0
-"""brahe writes a time and a quaternion a line; ACM, CSV and JSON have a covariance and more."""
+"""Text formats, and their longest time as a multiple of brahe's, which writes fewer values."""
 LEAST_OF_PYARROW, MOST_MB = 0.5, 300.0
 START = parse_utc("1996-01-10T00:00:00Z")
 
@@ -99,7 +99,7 @@ def _parquet(quick: bool, seed: int, figures: dict[str, Any]) -> Iterator[Bound]
 
 
 def _written_from_memory(table: Any, folder: Path, quick: bool) -> tuple[float, float]:
-    """The seconds that the service and pyarrow take to write the same Python values."""
+    """Seconds that the service and pyarrow take to write the same Python values."""
     values = [table[name].to_pylist() for name in table.column_names]
     pages = [
         [column[first : first + BATCHES_READ] for column in values]
@@ -125,7 +125,7 @@ def _written_from_memory(table: Any, folder: Path, quick: bool) -> tuple[float, 
 
 
 def _differing(file: Path, table: Any) -> int:
-    """How many columns of numbers DuckDB reads with other bits."""
+    """Number of numeric columns that DuckDB reads with differing bits."""
     import duckdb
 
     names = [each.name for each in table.schema if each.type == pa.float64()]
@@ -145,7 +145,7 @@ def _bits(values: npt.NDArray[Any]) -> bytes:
 
 
 def _attitudes(count: int) -> AttitudeRows:
-    """Attitudes a second apart of a body that turns at 1 deg/s."""
+    """Attitudes one second apart of a body rotating at 1 deg/s."""
     turn = Rotation.from_rotvec(np.radians([0.3, -0.5, 0.8]) * np.arange(count)[:, None])
     times = [shifted(START, float(second)) for second in range(count)]
 

@@ -1,11 +1,11 @@
-"""A database of millions of batches to measure with.
+"""Test database with millions of batches.
 
     python -m benchmarks.speed.fill_database OUT.db
 
-Every table that lists, trends and alarms are read from is filled as the writer
-would have: batches, results, solutions, hourly and daily trends.  Answers and
-inputs are empty and stars are left out, except of the newest batches of each
-spacecraft, which are drawn, submitted and answered in earnest.
+All tables from which lists, trends and alarms are read have the rows that the writer would
+write: batches, results, solutions, hourly and daily trends.  Answers and inputs are empty, and
+stars are left out, except for the newest batches of each spacecraft: these are simulated, submitted
+and answered like any other.
 """
 
 import argparse
@@ -49,16 +49,16 @@ DEFAULT_BATCHES = 5_000_000
 CHUNK = 100_000
 CADENCE_S = 30
 NEWEST = 100
-"""Batches of each spacecraft that are real, after all the others."""
+"""Number of completely processed batches per spacecraft, after all filled-in ones."""
 START = "1999-03-01T00:00:00.000Z"
-"""No leap second follows for almost seven years, so that every step is of equal length."""
+"""First time; no leap second follows for almost seven years, so all steps are equal."""
 
 Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Part:
-    """The batches of one spacecraft in one run."""
+    """Batches of one spacecraft in one run."""
 
     spacecraft: str
     run: str
@@ -66,7 +66,7 @@ class Part:
 
 
 def parts_of(total: int) -> list[Part]:
-    """Three spacecraft live, one of them much, and a run beside them."""
+    """Parts of the database: three spacecraft in the live run, and one further run."""
     shares = {("XTE", "live"): 0.5, ("SWAS", "live"): 0.25, ("SOHO", "live"): 0.15}
     found = [Part(*key, round(total * share)) for key, share in shares.items()]
     return [*found, Part("XTE", "reprocessed", total - sum(each.batches for each in found))]
@@ -88,7 +88,7 @@ def main() -> None:
 
 
 def fill(output: Path, total: int, seed: int, newest: int) -> None:
-    """Make the database."""
+    """Write the database."""
     app = open_app(Settings(database=f"sqlite:///{output}"))
     digests = {each.name: each.digest for each in app.missions.values()}
     catalog = app.sky.catalog.digest
@@ -145,7 +145,7 @@ def _fill_part(
 
 
 def _drawn(rng: np.random.Generator, place: npt.NDArray[np.int64]) -> dict[str, Floats]:
-    """Columns of results: mostly nominal, a bad hour every few days, attitudes that are missing."""
+    """Columns of results: mostly nominal, with a bad hour every few days and missing attitudes."""
     n = len(place)
     bad = rng.random(n) < np.where((place * CADENCE_S // HOUR_S) % 97 == 13, 0.5, 0.01)
     ambiguous = np.where(bad, rng.integers(0, 4, n), 0)
@@ -242,7 +242,7 @@ def _rows(
 
 
 def _rollups(drawn: dict[str, Floats], bucket: npt.NDArray[np.int64]) -> Iterator[dict[str, Any]]:
-    """The rollup of every bucket in a chunk (see `rolled_up` of the result metrics)."""
+    """Rollup of every bucket in a chunk (see `rolled_up` of the result metrics)."""
     numbers, first = np.unique(bucket, return_index=True)
     columns: dict[str, Any] = {"bucket": numbers.tolist()}
     columns["batches"] = np.diff([*first.tolist(), len(bucket)]).tolist()
@@ -260,7 +260,7 @@ def _rollups(drawn: dict[str, Floats], bucket: npt.NDArray[np.int64]) -> Iterato
 
 
 def _merged(rows: Sequence[dict[str, Any]]) -> Iterator[dict[str, Any]]:
-    """Rollups in order, those of one bucket that two chunks shared put together."""
+    """Rollups in order; those of a bucket that is split between two chunks are combined."""
     last: dict[str, Any] | None = None
     for row in rows:
         if last is None or row["bucket"] != last["bucket"]:
@@ -279,7 +279,7 @@ def _merged(rows: Sequence[dict[str, Any]]) -> Iterator[dict[str, Any]]:
 
 
 def _newest(output: Path, total: int, seed: int, newest: int) -> None:
-    """Real batches after the others, with stars, answers and all that belongs to them."""
+    """Append completely processed batches with stars, answers and related rows."""
     if not newest:
         return
     app = open_app(Settings(database=f"sqlite:///{output}"))

@@ -44,14 +44,14 @@ POSTS, QUICK_POSTS = 3_000, 300
 MOST_MS = 150.0
 CUT_STARTS, QUICK_CUT_STARTS = 10, 1
 LATEST_CUT_S = 60.0
-"""A first start is cut short before this; it takes about as long until everything is compiled."""
+"""Greatest delay in seconds before a first start is interrupted, about the compile time."""
 COMPILING_S = 1800.0
 LEAST_WHOLE_SKY = 0.01
-"""The share of posts for which the whole sky is searched."""
+"""Least share of posts that need a search of the whole sky."""
 
 
 class Post(NamedTuple):
-    """How long a post took, processor time of the server's threads, and which search it needed."""
+    """Duration of a post, processor time of the server's threads, and the kind of search."""
 
     wait_ms: float
     processor_ms: float
@@ -60,11 +60,11 @@ class Post(NamedTuple):
     batch: str
     path: str
     refused: int
-    """The number of times that it was answered 503 before."""
+    """Number of earlier answers with status 503."""
 
 
 class CutStart(NamedTuple):
-    """Posts after a first start that was cut short, and kernels compiled after the build."""
+    """Posts after an interrupted first start, and number of kernels compiled after the build."""
 
     after_s: float
     posts: list[Post]
@@ -72,7 +72,7 @@ class CutStart(NamedTuple):
 
 
 def run(quick: bool, seed: int) -> Report:
-    """The benchmark."""
+    """Benchmark of first posts."""
     bodies = _bodies(QUICK_POSTS if quick else POSTS, seed)
     with tempfile.TemporaryDirectory() as folder:
         with service(Path(folder) / "once.db") as served:
@@ -122,7 +122,7 @@ def run(quick: bool, seed: int) -> Report:
 
 
 def _cut_start(after_s: float, bodies: Sequence[dict[str, Any]]) -> CutStart:
-    """Interrupt a first start after so many seconds, and post to the next one."""
+    """Interrupt a first start after a delay, and post to the next server."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         environment = {"NUMBA_CACHE_DIR": str(folder / "kernels")}
@@ -147,7 +147,7 @@ def _cut_start(after_s: float, bodies: Sequence[dict[str, Any]]) -> CutStart:
 
 
 def _built_at(kernels: Path) -> float:
-    """Wait until the mark of a complete build is there; the time of it."""
+    """Wait for the mark of a complete build; returns its time."""
     last = time.monotonic() + COMPILING_S
     while not (marks := list(kernels.glob("complete-*"))):
         if time.monotonic() > last:
@@ -157,7 +157,7 @@ def _built_at(kernels: Path) -> float:
 
 
 def _bodies(count: int, seed: int) -> list[dict[str, Any]]:
-    """Batches of the missions in turn."""
+    """Batches of the missions in rotation."""
     sky, missions = SkyModel(load_embedded(), LruCache(64 << 20)), load_missions()
     wanted = Pass(batches=count // len(MISSIONS), seed=seed)
     passes = [draw_pass(missions[name], sky, wanted) for name in MISSIONS]

@@ -32,7 +32,7 @@ ARCHIVE = "the archive"
 
 
 def bytes_a_batch(count: int, seed: int) -> dict[str, float]:
-    """The bytes of a batch with its answer, trends and all that is kept with it."""
+    """Bytes per batch with its answer, trends and all related rows."""
     found = {}
     with tempfile.TemporaryDirectory() as name:
         url, place = f"sqlite:///{Path(name) / 'year.db'}", Path(name) / "archive"
@@ -56,7 +56,7 @@ def bytes_a_batch(count: int, seed: int) -> dict[str, float]:
 
 
 def year(sizes: Mapping[str, float], posts_a_second: float) -> str:
-    """The table of fleets in Markdown."""
+    """Markdown table of fleets."""
     rows = []
     for spacecraft in FLEETS:
         for label, period_s in PERIODS_S.items():
@@ -72,13 +72,13 @@ def year(sizes: Mapping[str, float], posts_a_second: float) -> str:
 
 
 def number_text(number: float) -> str:
-    """A number rounded to three digits, without an exponent: 105,000."""
+    """Text of a number rounded to three digits, without an exponent: 105,000."""
     rounded = float(f"{number:.3g}")
     return f"{rounded:,.0f}" if rounded >= 1_000 else f"{rounded:g}"
 
 
 def main() -> None:
-    """Measure, print, and write the page if asked to."""
+    """Command that measures, prints, and writes the page on request."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -1,4 +1,4 @@
-"""Votes, TRIAD and QUEST beside bare kernels of the same work; pairs of stars beside a k-d tree.
+"""Votes, TRIAD and QUEST against bare kernels; star pairs against a k-d tree.
 
     python -m benchmarks kernels
 
@@ -51,11 +51,11 @@ VIEWS, QUICK_VIEWS = 300, 40
 ROUNDS = 9
 MOST_MANY, MOST_PAIRS = 1.5, 1.5
 MOST_MANY_OF_THREE = 3.0
-"""In a cap three stars leave so little work that what any call costs is most of it."""
+"""Limit as a multiple of the bare kernel; with three stars in a cap call overhead dominates."""
 MOST_ONE, MOST_ONE_OF_THREE = 8.0, 12.0
-"""A call from Python takes named tuples of some forty arrays and numbers apart: 10 to 20 us."""
+"""Limits for one batch: a Python call unpacks some forty arrays and numbers in 10 to 20 us."""
 LEAST_NAMED = {3: 0.3, 5: 0.9, 8: 0.98, 12: 0.98}
-"""By votes, of views of so many stars: three share their votes with too many others."""
+"""Least share of stars named by votes, by star count: three stars have too few votes."""
 AGREE_ARCSEC = 0.01
 MOST_UNSOLVED = 0.02
 MEGABYTES_512 = 512 << 20
@@ -65,7 +65,7 @@ PAIRED_STARS, PAIRED_DEG = 3_000, 8.0
 
 @dataclass(frozen=True)
 class Place:
-    """A kind of zone by its mission and the number of pairs that is looked for."""
+    """Kind of zone: its mission and the desired number of pairs."""
 
     mission: str
     pairs: int
@@ -80,7 +80,7 @@ PLACES = {
 
 @dataclass(frozen=True)
 class Views:
-    """Views of n stars in one zone: what is observed (k, n, 3), and what is true (k, n)."""
+    """Views of n stars in one zone: observed vectors (k, n, 3), and true rows (k, n)."""
 
     zone: Zone
     region: SearchRegion
@@ -95,7 +95,7 @@ class Views:
 def zone_near(
     place: Place, sky: SkyModel, rng: np.random.Generator
 ) -> tuple[Mission, Zone, SearchRegion]:
-    """Of many zones one whose number of pairs is about that which is asked for, or the fullest."""
+    """Random zone with about the desired number of pairs, or the one with most pairs."""
     mission = load_missions()[place.mission]
     catalog = sky.run_catalog(mission, MOMENT)
     zone_of = mission.zone
@@ -177,7 +177,7 @@ def _any_attitude(rng: np.random.Generator) -> Vector:
 
 
 class Room(NamedTuple):
-    """What the service's kernels write to, made once for many batches."""
+    """Output arrays of the service's kernels, allocated once for many batches."""
 
     ballots: Any
     tallies: Any
@@ -212,10 +212,10 @@ def _room_for(n: int, stars: int) -> Room:
 def service_many(  # type: ignore[no-untyped-def]
     views, like, zone, polar, bounds, rules, rows, worst, room, star, q
 ):
-    """The service's kernels over many batches, as `identify_by_votes` and `attitude_of` do.
+    """Run the service's kernels over many batches, as `identify_by_votes` and `attitude_of` do.
 
-    `views` are directions, magnitudes, body vectors and boresights (k, n, ...); `like`
-    has what the batches share.
+    `views` are directions, magnitudes, body vectors and boresights (k, n, ...); `like` has the
+    inputs that the batches share.
     """
     direction, magnitude, body, boresight = views
     still = np.zeros(3)
@@ -265,7 +265,7 @@ def _sighting(views: Views, mission: Mission, k: int) -> Sighting:
 
 
 def least_us(calls: Sequence[Callable[[], object]], each: int) -> list[float]:
-    """The least microseconds of each call over several rounds, in turn, shared among `each`."""
+    """Least microseconds of each call over several alternating rounds, divided by `each`."""
     for call in calls:
         call()
     least = [math.inf] * len(calls)
@@ -406,7 +406,7 @@ def _by_catalog_row(zone: Zone) -> Vector:
 def pairs_beside_a_tree(
     rng: np.random.Generator, quick: bool
 ) -> tuple[dict[str, Any], list[Bound]]:
-    """SIDS of stars drawn evenly over a band like SOHO's, beside a bare k-d tree of them."""
+    """Star pairs by SIDS, for stars spread evenly over a band, against a bare k-d tree."""
     figures: dict[str, Any] = {}
     bounds: list[Bound] = []
     for name, width_deg in (("whole sky", 90.0), ("band", 6.0)):
@@ -439,7 +439,7 @@ def pairs_beside_a_tree(
 
 
 def run(quick: bool, seed: int) -> Report:
-    """The benchmark: every place, each number of stars."""
+    """Benchmark of kernels for all places and numbers of stars."""
     sky = SkyModel(load_embedded(), LruCache(MEGABYTES_512))
     figures: dict[str, Any] = {}
     bounds: list[Bound] = []

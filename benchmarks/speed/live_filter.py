@@ -1,4 +1,4 @@
-"""Posts of batches and gyro blocks with the live filter, beside the same batches without either.
+"""Posts of batches and gyro blocks with the live filter, against the same batches without.
 
     python -m benchmarks live_filter
 
@@ -37,22 +37,22 @@ TABLE = """
 every_s = 0.1
 """
 POSTS, QUICK_POSTS = 1_000, 400
-"""Of a turn, at 16 connections: short, so that both services meet the same machine."""
+"""Posts of one turn over 16 connections: few, so that both services meet an equal load."""
 ONE_BY_ONE = 100
-"""Of a turn, over one connection."""
+"""Posts of one turn over one connection."""
 ROUNDS, QUICK_ROUNDS = 16, 2
 WARM = 400
 COMPARED = 100
 MOST_COST = 1.10
 MOST_SIGMAS = 5.0
 UP_TO_DATE_S = 60.0
-"""Until the filter has the last gyro sample: its thread rests twenty times as long as it works."""
+"""Seconds to wait until the live filter has processed the last gyro sample."""
 VARYING = ("id", "timings_us")
-"""Parts of an answer that no two posts have in common."""
+"""Parts of an answer that differ between any two posts."""
 
 
 def run(quick: bool, seed: int) -> Report:
-    """The benchmark."""
+    """Benchmark of the live filter."""
     count, rounds = (QUICK_POSTS, QUICK_ROUNDS) if quick else (POSTS, ROUNDS)
     with tempfile.TemporaryDirectory() as folder:
         missions = Path(folder) / "missions"
@@ -67,14 +67,14 @@ def run(quick: bool, seed: int) -> Report:
 
 
 def mission_in(folder: Path) -> Mission:
-    """The shipped XTE with a live filter, written to a folder of missions."""
+    """Shipped XTE mission with a live filter, written to a folder of missions."""
     file = folder / "xte.toml"
     file.write_text((SHIPPED_FOLDER / "xte.toml").read_text("utf-8") + TABLE, "utf-8")
     return read_mission(file)
 
 
 def _drawn(mission: Mission, count: int, seed: int) -> list[DrawnBatch]:
-    """A nominal pass of a batch a second, with a gyro sample a second."""
+    """Nominal pass with a batch and a gyro sample per second."""
     sky = SkyModel(load_embedded(), LruCache(64 << 20))
     wanted = Pass(count, seed, cadence_s=1.0, troubles=NO_TROUBLES, angles_share=0.0)
     drawn = draw_pass(mission, sky, wanted)
@@ -144,7 +144,7 @@ def _measured(filtering: Served, plain: Served, drawn: Sequence[DrawnBatch], cou
 
 
 def _post(server: Served, part: Sequence[DrawnBatch], name: str, connections: int) -> Driven:
-    """Post batches, and where there is a gyro its blocks among them."""
+    """Post batches, with their gyro blocks to the service with a filter."""
     driven = drive(server.port, list(_requests(part, name == "with")), connections)
     if set(driven.statuses) != {201}:
         raise RuntimeError(f"{name}: {driven.statuses}")
@@ -162,7 +162,7 @@ def _requests(part: Sequence[DrawnBatch], has_gyro: bool) -> Iterator[bytes]:
 
 
 def _up_to_date(server: Served, last: DrawnBatch) -> tuple[float, dict[str, Any]]:
-    """How long the filter takes to reach the last gyro sample, and its attitude there."""
+    """Seconds until the filter reaches the last gyro sample, and its attitude at that time."""
     begun = time.perf_counter()
     while (passed_s := time.perf_counter() - begun) < UP_TO_DATE_S:
         try:
@@ -176,7 +176,7 @@ def _up_to_date(server: Served, last: DrawnBatch) -> tuple[float, dict[str, Any]
 
 
 def _differing(filtering: Served, plain: Served) -> tuple[int, int]:
-    """Of the newest batches of both services: how many are compared, and how many differ."""
+    """Number of newest batches compared between both services, and number of differing ones."""
     found = []
     for server in (filtering, plain):
         items = read_json(server, f"{API}/batches?limit={5 * COMPARED}")["items"]
@@ -193,7 +193,7 @@ def _differing(filtering: Served, plain: Served) -> tuple[int, int]:
 
 
 def _lasting(answer: dict[str, Any]) -> dict[str, Any]:
-    """An answer without its id and its times, and without what names the mission file."""
+    """Answer without id, times, mission file and cache state."""
     kept = {key: value for key, value in answer.items() if key not in VARYING}
     kept["provenance"] = {k: v for k, v in answer["provenance"].items() if k != "mission"}
     for each in kept["observations"]:

@@ -1,7 +1,7 @@
-"""Posts over a few connections as fast as they are answered, and how long each one took.
+"""HTTP client that posts over a few connections as fast as possible, and measures the times.
 
-The client is bare: requests are bytes that were made before, of an answer its
-status and its length are looked at.  It costs a tenth of what it measures.
+Requests are bytes made in advance; of an answer the client reads only status and length.  It costs
+a tenth of the measured work.
 """
 
 import asyncio
@@ -31,7 +31,7 @@ _LENGTH = b"content-length: "
 
 @dataclass
 class Driven:
-    """What came of some posts: seconds in all, milliseconds of each, answers by status."""
+    """Result of several posts: total seconds, milliseconds of each, number of answers by status."""
 
     seconds: float = 0.0
     waits_ms: list[float] = field(default_factory=list)
@@ -48,12 +48,12 @@ class Driven:
 
 
 def request(path: str, body: bytes, kind: str = "application/json") -> bytes:
-    """A post as it goes over the wire."""
+    """HTTP bytes of a post."""
     return HEAD.format(path=path, kind=kind, length=len(body)).encode() + body
 
 
 def get(path: str) -> bytes:
-    """A request for a page as it goes over the wire."""
+    """HTTP bytes of a GET request."""
     return f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode()
 
 
@@ -64,9 +64,9 @@ def drive(
     gap_s: float = 0.0,
     per_second: float = math.inf,
 ) -> Driven:
-    """Send every request once; a connection waits for an answer, and `gap_s`, before its next.
+    """Send every request once; a connection waits for the answer, and `gap_s`, before its next.
 
-    Nor does it send one before its turn comes at so many `per_second` in all.
+    All connections together send at most `per_second` requests per second.
     """
     return uvloop.run(_drive(port, iter(requests), connections, gap_s, per_second))
 
@@ -90,7 +90,7 @@ async def _drive(
 
 
 def _paced(requests: Iterator[bytes], per_second: float) -> Iterator[tuple[float, bytes]]:
-    """Requests, each with the time before which it is not sent."""
+    """Requests, each with its earliest time of sending."""
     started = perf_counter()
     for number, each in enumerate(requests):
         yield started + number / per_second, each
@@ -101,7 +101,7 @@ def _same(client: "_Client") -> "_Client":
 
 
 class _Client(asyncio.Protocol):
-    """One connection."""
+    """Client side of one connection."""
 
     def __init__(
         self, requests: Iterator[tuple[float, bytes]], driven: Driven, gap_s: float

@@ -1,4 +1,4 @@
-"""The least that a post can cost here: `uvicorn benchmarks.speed.no_op:app`.
+"""Lower limit of the cost of a post: `uvicorn benchmarks.speed.no_op:app`.
 
 The same server, framework and body as those of the service.  `/no-op` takes a
 batch as a route of the framework does, by the model of the body, and answers a

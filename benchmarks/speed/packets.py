@@ -1,4 +1,4 @@
-"""How fast packets are read beside space-packet-parser: `python -m benchmarks packets`.
+"""Speed of reading packets, against space-packet-parser: `python -m benchmarks packets`.
 
 Real packets of JPSS-1, 7,200 in two hours, in turns so that both meet the same load.
 """

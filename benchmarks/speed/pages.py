@@ -36,7 +36,7 @@ MONTH_S = 30 * DAY_S
 
 @dataclass(frozen=True)
 class Asked:
-    """The data behind one part of a page, how long it may take, and what must be true of it."""
+    """Data behind one part of a page, with a time limit and a check of the answer."""
 
     page: str
     what: str
@@ -46,7 +46,7 @@ class Asked:
 
 
 def asked_of(app: App) -> list[Asked]:
-    """Every page's data."""
+    """Data of all pages."""
     overview = app.spacecraft.overview()
     latest = parse_utc(overview.as_of)
     first = shifted(latest, -MONTH_S)
@@ -144,7 +144,7 @@ def asked_of(app: App) -> list[Asked]:
 
 @dataclass(frozen=True)
 class Measured:
-    """Milliseconds, and whether the answer is right."""
+    """Measured milliseconds, and whether the answer is right."""
 
     asked: Asked
     median_ms: float
@@ -154,11 +154,11 @@ class Measured:
 
     @property
     def passed(self) -> bool:
-        """Whether it is right and fast enough."""
+        """True if the answer is right, and within its time limit."""
         return self.right and self.processor_ms <= self.asked.bound_ms
 
     def line(self) -> str:
-        """Its line in the table."""
+        """Line of the printed table."""
         told = "right" if self.right else "WRONG"
         slow = "" if self.processor_ms <= self.asked.bound_ms else ", TOO SLOW"
         times = f"{self.median_ms:>10.2f}{self.fastest_ms:>9.2f}{self.processor_ms:>11.2f}"
@@ -210,7 +210,7 @@ def _is_list(found: Any) -> bool:
 
 
 def _worst(app: App, start: Utc, end: Utc) -> float:
-    """The greatest share of ambiguous stars, by looking at every batch."""
+    """Greatest share of ambiguous stars, found by reading all batches."""
     with app.store.reading() as connection:
         found = connection.exec_driver_sql(
             "SELECT MAX(1.0 * ambiguous / observed) FROM results WHERE current = 1 AND "

@@ -35,10 +35,10 @@ from tests.reference.compare import Judge, zone_searched
 
 BATCHES, QUICK_BATCHES = 300, 30
 DEADLINE_S = {"cap": 4.0, "band": 600.0}
-"""The 1994 requirement for XTE and SWAS, and for SOHO."""
+"""Deadline in seconds by kind of zone, required in 1994 of XTE and SWAS, and of SOHO."""
 DEADLINE_FACTOR = 100.0
 BOUND_US = {"cap": 100.0, "band": 400.0}
-"""Median of identification and solution together in a cached zone."""
+"""Limit in microseconds of the median identification and solution in a cached zone."""
 WHOLE_US = {"cap": 200.0, "band": 700.0}
 EMPTY_CALLS = {"cap": 60.0, "band": 400.0}
 LEAST_OVER_PLAIN = 2.0
@@ -57,20 +57,20 @@ PLACES = {
 
 @njit(nogil=True)
 def nothing(direction, magnitude, separation, brighter, dimmer, votes):  # type: ignore[no-untyped-def]
-    """The least that a compiled identification can cost: its call."""
+    """Compiled function without work: a lower limit of the cost of an identification."""
     return len(votes)
 
 
 @dataclass(frozen=True)
 class Place:
-    """The figures of one kind of zone."""
+    """Figures of one kind of zone."""
 
     figures: dict[str, Any]
     bounds: list[Bound]
 
 
 def run(quick: bool, seed: int) -> Report:
-    """The benchmark: every place, one after another, on one sky."""
+    """Benchmark of the pipeline in every place, with one sky."""
     sky = SkyModel(load_embedded(), LruCache(MEGABYTES_256))
     prewarm_kernels(sky, load_missions(), IDENTIFIERS)
     figures: dict[str, Any] = {}
@@ -87,7 +87,7 @@ def run(quick: bool, seed: int) -> Report:
 def measured(
     name: str, count: int, rng: np.random.Generator, sky: SkyModel, step: Callable[[int], object]
 ) -> Place:
-    """One place: nominal batches of five stars about one a priori attitude."""
+    """Figures of one place: nominal batches of five stars about one a priori attitude."""
     mission_name, place = PLACES[name]
     toml = tomllib.loads((SHIPPED_FOLDER / f"{mission_name.lower()}.toml").read_text("utf-8"))
     judge = Judge(toml, sky)
@@ -165,7 +165,7 @@ def measured(
 
 
 def _cold(batch: ObservationBatch, judge: Judge, sky: SkyModel) -> tuple[float, int]:
-    """Milliseconds of a first answer without its zone, and zones built by many first requests."""
+    """Milliseconds of a first answer without its zone, and zones built by parallel requests."""
     times = []
     for _ in range(3):
         fresh = SkyModel(sky.catalog, LruCache(MEGABYTES_256))

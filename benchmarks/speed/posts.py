@@ -1,4 +1,4 @@
-"""Posts: one by one beside a no-op, in bulk beside parsing and inserting alone, both at once.
+"""Posts one by one against a no-op, in bulk against parsing and inserting, and both together.
 
     python -m benchmarks posts
 
@@ -43,48 +43,47 @@ API = "/api/v1"
 FIRST = datetime.fromisoformat(DEFAULT_START)
 CONNECTIONS = 16
 POSTS, QUICK_POSTS = 2_000, 800
-"""Of a turn: short, so that a server and its no-op meet the same machine, and many turns."""
+"""Posts of one turn: few, so that a server and its no-op meet an equal load."""
 ONE_BY_ONE = 200
-"""Of a turn, over one connection."""
+"""Posts of one turn over one connection."""
 BULK, QUICK_BULK = 30_000, 3_000
 ROUNDS, QUICK_ROUNDS = 9, 3
 PACED, QUICK_PACED = 1_000, 200
 GAP_S = 0.02
-"""Between the posts of a connection, where waits and not rates are measured."""
+"""Seconds between the posts of a connection when waiting times are measured."""
 CHUNK = 250
 LEAST_OF_NO_OP, LEAST_OF_CEILING, MOST_WAIT, MOST_READY_S = 0.25, 0.5, 3.0, 3.0
 MOST_CPU_US = {8: 1_000.0, 1: 1_400.0}
-"""Of a post, by connections."""
+"""Greatest processor time of a post in microseconds, by number of connections."""
 MOST_OF_LIVEZ, MOST_BYTES = 4.0, 2_500.0
 MOST_READY_MB, MOST_AFTER_MB, MOST_BULK_MB = 700.0, 800.0, 1600.0
-"""Of all processes of the service together."""
+"""Greatest memory in MB of all processes of the service together."""
 MOST_FIRST = 1.5
-"""Posts in a row that the first may take longer than later ones after the same pause.
+"""Greatest delay of the first post over later ones, in durations of consecutive posts.
 
-No share of theirs: a processor that slept makes them take 1.3 ms at one time and 3 at another.
+Durations after a pause are no unit: a processor that slept makes them 1.3 or 3 ms.
 """
 STARTS, SEEN, LATER, PAUSE_S = 9, 40, 5, 0.05
 RIGHT = 0.98
 ALARM_LOAD, MOST_ALARM_S = 500, 0.5
-"""Posts a second beside those that raise an alarm."""
+"""Posts per second under load, and greatest delay of an alarm in seconds."""
 
 
 @dataclass(frozen=True)
 class Telemetry:
-    """Batches of a pass, and the star ids that are true of each."""
+    """Batches of a pass, with the true star ids of each."""
 
     drawn: Sequence[DrawnBatch]
     _seconds: Iterator[int] = field(default_factory=itertools.count)
 
     def bodies(self, count: int, tag: str) -> list[bytes]:
-        """So many bodies, each under a name of its own."""
+        """Bodies of `count` posts, each with a name of its own."""
         return [self.body(k, f"{tag}-{k}") for k in range(count)]
 
     def body(self, k: int, name: str) -> bytes:
-        """One body, under a name and dated a second after the one before it.
+        """Body of one post with a name, dated one second after the previous one.
 
-        A tracker's batches come in order of their times.  A day later the same stars
-        stand within an arcsecond of each other where they stood.
+        A tracker's batches must be in order of time.  Stars move less than an arcsecond in a day.
         """
         time = (FIRST + timedelta(seconds=next(self._seconds))).strftime("%Y-%m-%dT%H:%M:%SZ")
         own = {"options": {"identifier": "starid"}, "batch": name, "time": time}
@@ -94,14 +93,14 @@ class Telemetry:
         return self.drawn[k % len(self.drawn)]
 
     def right(self, k: int, answer: dict[str, Any]) -> tuple[int, int]:
-        """Of an answer's stars how many are named as they were drawn, and all."""
+        """Number of stars in an answer with the right name, and number of all."""
         named = [star["star"] and star["star"]["id"] for star in answer["observations"][0]["stars"]]
         true = self._of(k).truth["observations"][0]["stars"]
         return sum(one == other for one, other in zip(named, true, strict=True)), len(named)
 
 
 def telemetry(seed: int) -> Telemetry:
-    """A nominal pass of XTE, long enough that its batches do not look alike."""
+    """Nominal pass of XTE, long enough for varied batches."""
     sky = SkyModel(load_embedded(), LruCache(64 << 20))
     wanted = Pass(batches=400, seed=seed, troubles=NO_TROUBLES, angles_share=0.0)
     return Telemetry(list(draw_pass(load_missions()["XTE"], sky, wanted)))
@@ -136,7 +135,7 @@ def _finished(served: Served, place: str) -> dict[str, Any]:
 
 
 def singles(quick: bool, pass_: Telemetry, folder: Path) -> tuple[dict[str, Any], list[Bound]]:
-    """Single posts beside the no-op, and the start of the service."""
+    """Figures of single posts against the no-op, and of the start of the service."""
     count, rounds = (QUICK_POSTS, QUICK_ROUNDS) if quick else (POSTS, ROUNDS)
     starts = _starts(2 if quick else STARTS, pass_, folder / "start.db")
     ready_s, first, in_a_row, later = (median(each) for each in zip(*starts, strict=True))
@@ -232,13 +231,12 @@ def singles(quick: bool, pass_: Telemetry, folder: Path) -> tuple[dict[str, Any]
 def _starts(
     count: int, pass_: Telemetry, database: Path
 ) -> list[tuple[float, float, float, float]]:
-    """Of some starts the seconds until ready, and the ms of the first post and of later ones.
+    """Seconds until ready, and milliseconds of first and later posts, of several starts.
 
-    All are of the latest view before the start, which is what the service expects,
-    and come after a pause: whatever was not used for a while has to find its way
-    into the caches again, and the processor its speed.  Of the later ones the middle of
-    some, for the first after much work finds both.  Between come earlier views, one after
-    the other; the time of the last of those is given as well.
+    All measured posts are of the latest view before the start, which the service expects, and
+    follow a pause, after which caches and the processor are slow.  Of the later ones the median
+    counts, since the first one after much work is slow.  Earlier views are posted in between, one
+    after another; the time of the last of them is also returned.
     """
     with service(database) as served:
         _posted(served, f"{API}/batches", pass_.bodies(SEEN, "before"))
@@ -263,7 +261,7 @@ def _after_pause_ms(served: Served, body: bytes) -> float:
 
 
 def alarms(quick: bool, pass_: Telemetry, folder: Path) -> tuple[dict[str, Any], list[Bound]]:
-    """Seconds from a post to the alarm in the event stream that it causes, idle and under load."""
+    """Seconds from a post to the resulting alarm in the event stream, idle and under load."""
     figures, bounds = {}, []
     with (
         service(folder / "alarms.db") as served,
@@ -309,7 +307,7 @@ def _in_run(body: bytes, run: str) -> bytes:
 
 
 def _with_a_false_star(body: bytes, is_out: bool) -> bytes:
-    """A batch with, or without, a star that the catalog does not have."""
+    """Batch with or without a star that is not in the catalog."""
     batch = json.loads(body)
     stars = batch["observations"][0]["stars"]
     if is_out:
@@ -318,14 +316,14 @@ def _with_a_false_star(body: bytes, is_out: bool) -> bytes:
 
 
 def _alarm_times(stream: Iterable[bytes]) -> Iterator[float]:
-    """The moments at which alarms come in the event stream."""
+    """Times of arrival of alarms in the event stream."""
     for line in stream:
         if line.startswith(b"event: alarm"):
             yield time.perf_counter()
 
 
 def bulk(quick: bool, pass_: Telemetry, folder: Path) -> tuple[dict[str, Any], list[Bound]]:
-    """Bulk beside its ceiling, and the waits of single posts while it runs."""
+    """Figures of bulk loading against its limit, and waiting times of single posts meanwhile."""
     count = QUICK_BULK if quick else BULK
     bounds: list[Bound] = []
     lines = pass_.bodies(count, "bulk")
@@ -371,18 +369,18 @@ def bulk(quick: bool, pass_: Telemetry, folder: Path) -> tuple[dict[str, Any], l
 
 
 def warm(served: Served, pass_: Telemetry) -> None:
-    """Posts that are not measured."""
+    """Warm up the service with posts that are not measured."""
     _posted(served, f"{API}/batches", pass_.bodies(400, "warm"))
 
 
 def waits_idle(served: Served, pass_: Telemetry, quick: bool) -> Driven:
-    """Single posts, paced, to a service that does nothing else."""
+    """Paced single posts to an otherwise idle service."""
     bodies = pass_.bodies(QUICK_PACED if quick else PACED, "idle")
     return _posted(served, f"{API}/batches", bodies, GAP_S)
 
 
 def waits_beside(served: Served, pass_: Telemetry, work: Callable[[], object]) -> Driven:
-    """Single posts, paced as those of `waits_idle`, for as long as `work` takes."""
+    """Paced single posts, as in `waits_idle`, for the duration of `work`."""
     beside = Driven()
     over = threading.Event()
 
@@ -406,7 +404,7 @@ def waits_beside(served: Served, pass_: Telemetry, work: Callable[[], object]) -
 
 
 def _warm_bulk(served: Served, lines: Sequence[bytes]) -> None:
-    """A first replay has processes started; a second one is what they begin with."""
+    """Replay files until all processes of the service have started."""
     _finished(served, _start_replay(served, lines, "warm-1"))
     wanted, give_up = Settings.from_environment().replay_processes, time.monotonic() + START_S
     while _replay_processes(served) < wanted:
@@ -423,7 +421,7 @@ def _replay_processes(served: Served) -> float:
 
 
 def _parse_and_insert(lines: Sequence[bytes], database: Path) -> float:
-    """Batches a second of the service's own parser and rows, nothing worked out between."""
+    """Batches per second of the service's parser and row insertion, without computation."""
     app = open_app(Settings(database=f"sqlite:///{database}"))
     try:
         made = [submission_from_json(line, run="bulk") for line in lines]
@@ -443,7 +441,7 @@ def _parse_and_insert(lines: Sequence[bytes], database: Path) -> float:
 
 
 def run(quick: bool, seed: int) -> Report:
-    """The benchmark."""
+    """Benchmark of posts."""
     pass_ = telemetry(seed)
     with tempfile.TemporaryDirectory() as folder:
         figures, bounds = singles(quick, pass_, Path(folder))

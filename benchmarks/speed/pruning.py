@@ -33,7 +33,7 @@ from service.times import Utc
 
 RECORDED, DAYS = 10_000, 20
 MOST_AGAIN = 1.25
-"""What VACUUM leaves free is used again, so that a database that is pruned stops growing."""
+"""Greatest growth after refilling, as a ratio: space freed by VACUUM is used again."""
 BULK = "PostgreSQL: batches a second in bulk"
 DAY_S = 86_400
 LARGEST = ("batches", "results", "star_results", "solutions")
@@ -58,7 +58,7 @@ _LATER = """to_char(
 
 
 def measured(recorded: int, days: int, seed: int, url: str) -> Report:
-    """Fill an empty database and take its batches out again."""
+    """Fill an empty database, and prune its batches."""
     upgrade(url)
     count, half = recorded * days, days // 2
     figures: dict[str, float] = {"batches": count, "of these pruned": recorded * half}
@@ -93,14 +93,14 @@ def measured(recorded: int, days: int, seed: int, url: str) -> Report:
 
 
 def _forget_first(url: str) -> None:
-    """Delete the run that was recorded before the clock ran."""
+    """Delete the first run, which was recorded before the timed one."""
     store = Store(url, create=False)
     prune(store, time_at(DAY_S), "first")
     store.close()
 
 
 def _copy(engine: Engine, source: int, day: int) -> None:
-    """Copy the batches of one day, with all that was made of them and their trends, to another."""
+    """Copy the batches of one day to another, with results and trends."""
     shift = day - source
     with engine.begin() as connection:
         for table in COPIED:
@@ -123,7 +123,7 @@ def _copy(engine: Engine, source: int, day: int) -> None:
 
 
 def _pruned(url: str, engine: Engine, days: int) -> dict[str, float]:
-    """Delete the batches of so many days, an hour at a time, then VACUUM."""
+    """Delete the batches of the first days, an hour at a time, then VACUUM."""
     figures = _reads(url, "filled", _noon(days))
     ends = []
     store = Store(url, create=False)
@@ -142,7 +142,7 @@ def _pruned(url: str, engine: Engine, days: int) -> dict[str, float]:
 
 
 def _archived(url: str, days: int) -> dict[str, float]:
-    """Archive the batches of so many days."""
+    """Archive the batches of the first days."""
     store = Store(url, create=False)
     with tempfile.TemporaryDirectory() as folder:
         start = time.perf_counter()
@@ -154,7 +154,7 @@ def _archived(url: str, days: int) -> dict[str, float]:
 
 
 def _dropped(engine: Engine, days: int) -> dict[str, float]:
-    """Copy the largest tables of so many days into partitions of their own, and drop these."""
+    """Copy the rows of several days in the largest tables to partitions, and drop these."""
     letters = ", ".join(f"'{each}'" for each in _LETTERS[:days])
     with engine.begin() as connection:
         for table in LARGEST:
@@ -179,12 +179,12 @@ def _dropped(engine: Engine, days: int) -> dict[str, float]:
 
 
 def _noon(day: int) -> Utc:
-    """An hour before the first batch of a day."""
+    """Time one hour before the first batch of a day."""
     return time_at(day * DAY_S - 3_600)
 
 
 def _reads(url: str, when: str, cut: Utc) -> dict[str, float]:
-    """Milliseconds of a list, empty once it is pruned, and of a history summed over batches."""
+    """Milliseconds of a list, empty after pruning, and of a history summed over batches."""
     app = open_app(Settings(database=url))
     try:
         reads = {
@@ -197,7 +197,7 @@ def _reads(url: str, when: str, cut: Utc) -> dict[str, float]:
 
 
 def _sizes(engine: Engine) -> dict[str, int]:
-    """Bytes of the large tables, with what PostgreSQL keeps beside them, and of their indexes."""
+    """Bytes of the large tables with their auxiliary storage, and of their indexes."""
     found = {}
     with engine.connect() as connection:
         for table in LARGEST:
@@ -215,10 +215,10 @@ def _size(engine: Engine) -> int:
 
 
 def _vacuum(engine: Engine, how: str) -> float:
-    """Seconds of a VACUUM of the tables, once nobody else can see what was deleted.
+    """Seconds of a VACUUM of the tables, after no session can see the deleted rows any longer.
 
     VACUUM keeps a deleted row while any session of the database has a snapshot from before the
-    deletion.  Where such a session stays open for too long, the figures hold its rows.
+    deletion.  If such a session stays open too long, the figures include its rows.
     """
     with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
         deleted = connection.exec_driver_sql("SELECT pg_current_xact_id()::xid").scalar_one()
@@ -232,7 +232,7 @@ def _vacuum(engine: Engine, how: str) -> float:
 
 
 def main() -> int:
-    """Measure and print; 1 without a database, or where a figure is out of bounds."""
+    """Command that measures and prints; returns 1 without a database, or out of bounds."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

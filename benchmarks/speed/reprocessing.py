@@ -1,4 +1,4 @@
-"""Reprocessing into an archive beside bulk loading, and two processes beside one.
+"""Reprocessing into an archive against bulk loading, and two processes against one.
 
     python -m benchmarks reprocessing           40,000 batches, some minutes
     python -m benchmarks reprocessing --quick   4,000
@@ -47,23 +47,23 @@ from service.times import parse_utc, shifted
 BATCHES, QUICK_BATCHES = 40_000, 4_000
 BESIDE, QUICK_BESIDE = 20_000, 2_000
 PARTITIONS = 40
-"""Of a day each."""
+"""Number of archive partitions, of one day each."""
 END_S = (PARTITIONS + 1) * 86_400.0
 PROCESSES = 2
 LEAST_OF_BULK, LEAST_OF_ONE = 1.0, 1.6
 START = "1999-03-01T00:00:00.000Z"
-"""The posts beside are dated years earlier."""
+"""First time of the batches; the simultaneous posts are dated years earlier."""
 
 
 class Pace:
-    """Batches a second since the first ones came."""
+    """Rate in batches per second from the first processed batches on."""
 
     def __init__(self) -> None:
         self._begun: tuple[float, int] | None = None
         self.rate = 0.0
 
     def note(self, done: int) -> None:
-        """Take that so many are done."""
+        """Record the number of batches processed so far."""
         now_s = time.perf_counter()
         if self._begun is None:
             if done:
@@ -109,7 +109,7 @@ def _archived(app: App, folder: Path) -> int:
 
 
 def measured(count: int, seed: int) -> tuple[dict[str, Any], list[Bound]]:
-    """The figures for so many batches."""
+    """Figures of reprocessing a number of batches."""
     lines = _telemetry(count, seed)
     bounds: list[Bound] = []
     with tempfile.TemporaryDirectory() as temporary:
@@ -146,7 +146,7 @@ def measured(count: int, seed: int) -> tuple[dict[str, Any], list[Bound]]:
 
 
 def beside(url: str, quick: bool, seed: int) -> tuple[dict[str, Any], list[Bound]]:
-    """The waits of single posts while the command runs again what was archived of `url`."""
+    """Waiting times of single posts while the command reprocesses an archive of the database."""
     count = QUICK_BESIDE if quick else BESIDE
     emptied(url)
     upgrade(url)
@@ -187,7 +187,7 @@ def beside(url: str, quick: bool, seed: int) -> tuple[dict[str, Any], list[Bound
 
 
 def run(quick: bool, seed: int) -> Report:
-    """The benchmark."""
+    """Benchmark of reprocessing."""
     figures, bounds = measured(QUICK_BATCHES if quick else BATCHES, seed)
     if postgresql := os.environ.get("TEST_POSTGRESQL_URL"):
         more, of_posts = beside(postgresql, quick, seed)

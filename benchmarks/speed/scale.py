@@ -1,4 +1,4 @@
-"""What a batch takes in SQLite, PostgreSQL and the archive.
+"""Bytes per batch in SQLite, PostgreSQL and the archive.
 
     python -m benchmarks scale --quick      twenty thousand batches
     python -m benchmarks.speed.scale --batches 1000000
@@ -52,7 +52,7 @@ BATCHES, QUICK_BATCHES = 1_000_000, 20_000
 CHUNK = 250
 SPACECRAFT = "XTE"
 FIRST_READ = "the first list of 100"
-"""A file is opened, and its part of the batches is decompressed."""
+"""Name of the first read, which opens a file and decompresses a part of its batches."""
 MOST_BYTES, MOST_NUMERIC_BYTES = 800.0, 280.0
 LEAST_OF_BULK, MOST_OF_LIVE = 1.0, 3.0
 SELDOM, OFTEN = "one in 5 minutes", "one a second"
@@ -64,12 +64,12 @@ DATABASES = {"sqlite": "SQLite", "postgresql": "PostgreSQL"}
 
 
 def run(quick: bool, seed: int) -> Report:
-    """The benchmark among the others."""
+    """Benchmark of scale."""
     return measured(QUICK_BATCHES if quick else BATCHES, seed)
 
 
 def measured(count: int, seed: int) -> Report:
-    """Record, archive, read and restore so many batches."""
+    """Record, archive, read and restore a number of batches."""
     figures: dict[str, Any] = {"batches": count}
     bounds: list[Bound] = []
     with tempfile.TemporaryDirectory() as folder:
@@ -103,7 +103,7 @@ def _opened(url: str, folder: Path | None = None) -> App:
 
 
 def filled(url: str, count: int, seed: int, period_s: float = PERIODS_S[OFTEN]) -> dict[str, Any]:
-    """Record so many batches in bulk: how fast, and how large the database is then."""
+    """Record batches in bulk; returns the rate, and the resulting size of the database."""
     name = DATABASES[url.split(":")[0].split("+")[0]]
     made = drawn(count + CHUNK, seed, period_s)
     app = _opened(url)
@@ -127,7 +127,7 @@ def filled(url: str, count: int, seed: int, period_s: float = PERIODS_S[OFTEN]) 
 
 
 def drawn(count: int, seed: int, period_s: float) -> Iterator[bytes]:
-    """So many batches of a nominal pass of XTE, as they would be posted."""
+    """JSON bodies of the batches of a nominal pass of XTE."""
     sky = SkyModel(load_embedded(), LruCache(64 << 20))
     start = FIRST.strftime("%Y-%m-%dT%H:%M:%SZ")
     wanted = Pass(count, seed, start, cadence_s=period_s, troubles=NO_TROUBLES)
@@ -136,7 +136,7 @@ def drawn(count: int, seed: int, period_s: float) -> Iterator[bytes]:
 
 
 def _seldom(folder: Path, seed: int) -> dict[str, float]:
-    """What a batch takes in an archive whose days have few of them."""
+    """Bytes per batch in an archive with few batches per day."""
     url, place = f"sqlite:///{folder / 'seldom.db'}", folder / "seldom"
     place.mkdir()
     app = _opened(url)
@@ -160,7 +160,7 @@ def bytes_in(folder: Path) -> int:
 
 
 def _of(figures: dict[str, Any], period: str) -> tuple[str, float]:
-    """The archive's figure of a period, and its name."""
+    """Name and value of the archive's figure for a period."""
     name = ARCHIVED.format(period)
     return name, figures[name]
 
@@ -171,7 +171,7 @@ def _record(app: App, bodies: list[bytes], run: str) -> None:
 
 
 def _archived(url: str, folder: Path, count: int) -> tuple[dict[str, Any], list[Bound]]:
-    """Move everything to an archive and read it there."""
+    """Move all batches to an archive, and read them there."""
     place = folder / "archive"
     place.mkdir()
     live, recorded = _read_ms(url, None, count), _digest(url)
@@ -219,7 +219,7 @@ def time_at(seconds: float) -> Utc:
 
 
 def _read_ms(url: str, folder: Path | None, count: int) -> dict[str, float]:
-    """Milliseconds of a page of a list and of trends: of batches that are old enough to go."""
+    """Milliseconds of a page of a list and of trends, for batches due for archiving."""
     start, end = time_at(0), time_at(count / 2)
     app = _opened(url, folder)
     try:
@@ -242,7 +242,7 @@ def same(figure: str, measured: str, recorded: str) -> Bound:
 
 
 def _digest(url: str) -> str:
-    """Of every batch as it came and was answered, in order of its id."""
+    """Digest of all batches as received and answered, ordered by id."""
     state = hashlib.sha256()
     engine = create_engine(url)
     chosen = select(batches.c.id, batches.c.input, results.c.answer).where(
@@ -256,7 +256,7 @@ def _digest(url: str) -> str:
 
 
 def _numeric_bytes(folder: Path) -> int:
-    """Compressed bytes of the columns of numbers."""
+    """Compressed bytes of all numeric columns."""
     total = 0
     for path in folder.rglob("*.parquet"):
         file = pq.ParquetFile(path)
@@ -269,7 +269,7 @@ def _numeric_bytes(folder: Path) -> int:
 
 
 def _leaves(schema: pa.Schema) -> list[bool]:
-    """Whether each column of the file is of numbers, in their order."""
+    """Flags of the file's columns in their order, true for numeric ones."""
 
     def walk(kind: pa.DataType) -> list[bool]:
         if pa.types.is_struct(kind):
@@ -285,7 +285,7 @@ def _leaves(schema: pa.Schema) -> list[bool]:
 
 
 def _size(url: str) -> int:
-    """Bytes of a database that is closed or at rest."""
+    """Bytes of a closed or idle database."""
     if url.startswith("sqlite"):
         path = Path(url.removeprefix("sqlite:///"))
         return sum(
@@ -301,7 +301,7 @@ def _size(url: str) -> int:
 
 
 def emptied(url: str) -> None:
-    """Drop what a scratch database of PostgreSQL holds."""
+    """Delete all content of a scratch PostgreSQL database."""
     engine = create_engine(url)
     with engine.begin() as connection:
         connection.execute(text("DROP SCHEMA public CASCADE"))
@@ -318,7 +318,7 @@ def size_text(size: float) -> str:
 
 
 def main() -> int:
-    """Measure and print; 1 where a figure is out of bounds."""
+    """Command that measures and prints; returns 1 if a figure is out of bounds."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -1,4 +1,4 @@
-"""Servers to measure: the service itself, and the no-op, each a process of its own."""
+"""Server processes for measurements: the service, and the no-op server."""
 
 import os
 import signal
@@ -15,29 +15,29 @@ from pathlib import Path
 from types import MappingProxyType
 
 START_S = 600.0
-"""Beyond the time that a first start compiles until it is ready, on a busy machine."""
+"""Seconds to wait for a server, more than a first start compiles on a busy machine."""
 _TICKS = os.sysconf("SC_CLK_TCK")
 
 
 @dataclass(frozen=True)
 class Served:
-    """A server that answers: its port and process, and the seconds until it said it was ready."""
+    """Running server: its port and process, and the seconds until it reported ready."""
 
     port: int
     pid: int
     ready_s: float
 
     def cpu_s(self) -> float:
-        """Processor time so far, of the processes that it started as well."""
+        """Processor seconds so far of the server and its child processes."""
         return sum(int(each) for pid in self._pids() for each in _stat(pid)[11:13]) / _TICKS
 
     def resident_mb(self) -> float:
-        """Memory that is held, by what it started as well; what is shared counts each time."""
+        """Memory in MB of the server and its child processes; shared pages count repeatedly."""
         pages = sum(int(Path(f"/proc/{pid}/statm").read_text().split()[1]) for pid in self._pids())
         return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
     def _pids(self) -> list[int]:
-        """The server and whatever it started, however far down."""
+        """Process ids of the server and of all its descendants."""
         parents = {}
         for each in Path("/proc").iterdir():
             if each.name.isdigit():
@@ -62,9 +62,9 @@ def service(
     missions: Path | None = None,
     environment: Mapping[str, str] = MappingProxyType({}),
 ) -> Iterator[Served]:
-    """`acquire serve` over a file of SQLite or a database of this URL, told to stop at the end.
+    """Run `acquire serve` with an SQLite file or a database URL, and stop it at the end.
 
-    `missions` is a folder of missions in place of the one that the environment names.
+    `missions` is a folder of missions that replaces the one in the environment.
     """
     url = database if isinstance(database, str) else f"sqlite:///{database}"
     arguments = ["-m", "service.cli", "serve", "--database", url]
@@ -77,7 +77,7 @@ def service(
 
 @contextmanager
 def no_op() -> Iterator[Served]:
-    """The no-op (`benchmarks.speed.no_op`) under the same server."""
+    """Run the no-op server (`benchmarks.speed.no_op`) on the same HTTP server."""
     arguments = ["-m", "uvicorn", "benchmarks.speed.no_op:app", "--http", "httptools"]
     arguments += ["--loop", "uvloop", "--no-access-log", "--log-level", "warning"]
     with _served(arguments, "/") as served:
@@ -109,7 +109,7 @@ def _served(
 
 
 def free_port() -> int:
-    """The number of a port that nothing listens on."""
+    """Number of a free port."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         return int(free.getsockname()[1])

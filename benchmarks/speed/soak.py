@@ -1,15 +1,13 @@
-"""An hour at 70 % of what the service can do: whether it goes on as it began.
+"""Hour at 70 % of the service's full rate: the end must perform as the beginning.
 
     python -m benchmarks soak           an hour; not among those that are run by default
     python -m benchmarks soak --quick   two minutes
 
-The service runs as it is served, over SQLite with synchronous=FULL.  What it
-can do is measured first, at 16 connections; then batches come at 70 % of that,
-each at its time, while a page is read every second.  Each batch was observed a
-second after the one before: the history grows by weeks.  Every minute the
-waiting times are taken, the memory of all processes, and an answer is looked
-at; every second the size of the write-ahead log.  At the end the records are
-counted.
+The service runs as it is served, over SQLite with synchronous=FULL.  The full rate is measured
+first, at 16 connections.  Then batches arrive at 70 % of it, evenly spaced, while a page is read
+every second.  Each batch is dated a second after the previous one, so that the history grows by
+weeks.  Waiting times, the memory of all processes and an answer are checked every minute, the size
+of the write-ahead log every second.  At the end the recorded batches are counted.
 """
 
 import json
@@ -35,21 +33,21 @@ SLICES, SLICE_S = 60, 60.0
 QUICK_SLICES, QUICK_SLICE_S = 12, 10.0
 PROBES, PROBED = 3, 3_000
 SETTLED = 1 / 6
-"""After so much of the time the memory is what it should stay."""
+"""Part of the time after which memory must stay constant."""
 MOST_DRIFT, MOST_LOG_MB, MOST_SLOWER = 0.05, 64.0, 2.0
 _NAME, _TIME = b"soak-NAME", b"soak-TIME"
 
 
 @dataclass
 class _Watched:
-    """What is seen second by second."""
+    """Values watched every second."""
 
     log_mb: list[float] = field(default_factory=list)
     reads: int = 0
 
 
 def _bodies(pass_: Telemetry, first: int, count: int) -> Iterator[bytes]:
-    """Requests of batches with names of their own; made as they are needed."""
+    """Requests of batches with separate names, made on demand."""
     # Weeks later the same stars stand within an arcsecond of each other where they stood.
     own = {"options": {"identifier": "starid"}, "batch": _NAME.decode(), "time": _TIME.decode()}
     templates = [json.dumps(drawn.batch | own).encode() for drawn in pass_.drawn]
@@ -74,7 +72,7 @@ def _recorded(served: Served) -> int:
 
 
 def run(quick: bool, seed: int) -> Report:
-    """Post for an hour, and compare its end with its beginning."""
+    """Post for an hour, and compare the end with the beginning."""
     pass_ = telemetry(seed)
     slices, slice_s = (QUICK_SLICES, QUICK_SLICE_S) if quick else (SLICES, SLICE_S)
     bounds: list[Bound] = []

@@ -1,4 +1,4 @@
-"""What a batch and a trend cost as the database fills.
+"""Cost of a batch and of a trend as the database fills.
 
     python -m benchmarks stored           five million batches: minutes, and 5 GB meanwhile
     python -m benchmarks stored --quick   twenty thousand
@@ -37,7 +37,7 @@ MOST_MONTH_MS, MOST_YEAR_MS = 10.0, 30.0
 
 
 def record_us(app: App, seed: int) -> float:
-    """Microseconds a batch of a file in bulk, the median chunk."""
+    """Microseconds per batch of a bulk file, from the median chunk."""
     bodies = telemetry(seed).bodies(RECORDED, f"stored-{seed}")
     made = [submission_from_json(body, run="stored") for body in bodies]
     app.submissions.submit_many(made[:CHUNK])
@@ -50,7 +50,7 @@ def record_us(app: App, seed: int) -> float:
 
 
 def milliseconds(call: Callable[[], object]) -> float:
-    """Of some calls, the median."""
+    """Median milliseconds of several calls."""
     spent = []
     for _ in range(REPEATS):
         started = time.perf_counter()
@@ -60,7 +60,7 @@ def milliseconds(call: Callable[[], object]) -> float:
 
 
 def _scan(app: App, start_ns: int, end_ns: int) -> tuple[int, int]:
-    """Observed and ambiguous stars of a stretch, counted from the results one by one."""
+    """Observed and ambiguous stars of a period, counted from single results."""
     query = text(
         "SELECT sum(observed), sum(ambiguous) FROM results WHERE +current = 1 AND +run = 'live' "
         "AND +spacecraft = 'XTE' AND +time_ns >= :start AND +time_ns < :end"
@@ -71,7 +71,7 @@ def _scan(app: App, start_ns: int, end_ns: int) -> tuple[int, int]:
 
 
 def measured(total: int, seed: int) -> tuple[dict[str, Any], list[Bound]]:
-    """The figures of one size, and of an empty database."""
+    """Figures of one size of the database, and of an empty one."""
     bounds: list[Bound] = []
     with tempfile.TemporaryDirectory() as folder:
         empty = open_app(Settings(database=f"sqlite:///{Path(folder) / 'empty.db'}"))
@@ -125,6 +125,6 @@ def measured(total: int, seed: int) -> tuple[dict[str, Any], list[Bound]]:
 
 
 def run(quick: bool, seed: int) -> Report:
-    """The benchmark: fill a database, then record in it and read trends of it."""
+    """Benchmark that fills a database, then records batches and reads trends in it."""
     figures, bounds = measured(QUICK_BATCHES if quick else BATCHES, seed)
     return Report("stored", figures, bounds)

@@ -1,4 +1,4 @@
-"""What verified identification costs beside the votes: five stars, warm, in batches.
+"""Cost of verified identification against votes: five stars, warm, in batches.
 
     python -m benchmarks verified_cost
 
@@ -49,7 +49,7 @@ Rows = npt.NDArray[np.int64]
 STARS = 5
 VIEWS, QUICK_VIEWS = 2000, 100
 VIEWS_PER_ZONE = 100
-"""In one call of a kernel, so that what the call itself costs does not count."""
+"""Number of views in one kernel call, so that the overhead of a call is negligible."""
 REPEATS = 9
 VOTES, EXHAUSTIVE, EARLY = "votes", "exhaustive", "early stop"
 LEAST_NAMED = {VOTES: 0.95, EXHAUSTIVE: 0.998, EARLY: 0.998}
@@ -57,7 +57,7 @@ LEAST_NAMED = {VOTES: 0.95, EXHAUSTIVE: 0.998, EARLY: 0.998}
 
 @dataclass(frozen=True)
 class Place:
-    """A run of the paper, and what may be spent there: microseconds, or times the votes."""
+    """Run of the paper with a time limit in microseconds, or as a multiple of the votes' time."""
 
     table: str
     run: str
@@ -65,7 +65,7 @@ class Place:
 
     @property
     def prior_error(self) -> str:
-        """How far the a priori attitude is off about body Z, Y and X."""
+        """Error of the a priori attitude about body Z, Y and X, as text."""
         run = next(r for r in the_paper().runs if (r.table, r.run) == (self.table, self.run))
         return ", ".join(
             f"{each / 3600.0:g}°" if each >= 3600.0 else f'{each:g}"'
@@ -82,7 +82,7 @@ PLACES = {
 
 @dataclass(frozen=True)
 class Cost:
-    """Microseconds a view by kernel, and the shares of its stars named and named wrongly."""
+    """Microseconds per view by kernel, and shares of stars named rightly and wrongly."""
 
     views: int
     least_us: dict[str, float]
@@ -93,7 +93,7 @@ class Cost:
 def sightings(
     place: Place, views: int, seed: int, sky: SkyModel
 ) -> Iterator[list[tuple[Sighting, Rows]]]:
-    """Views of five stars, zone by zone, with the zone rows that are true."""
+    """Views of five stars by zone, with their true zone rows."""
     run = next(r for r in the_paper().runs if (r.table, r.run) == (place.table, place.run))
     world = replace(the_paper().worlds[run.world], views=VIEWS_PER_ZONE)
     mission = paper_mission(world.mission)
@@ -113,7 +113,7 @@ def sightings(
 
 
 def _sighting(acquired: Acquisition, sky: SkyModel) -> Sighting:
-    """The input of the identifier, from what the pipeline keeps of it."""
+    """Input of the identifier, restored from the stored results of the pipeline."""
     batch, mission, tracker = acquired.batch, acquired.mission, acquired.trackers[0]
     assert batch.a_priori is not None
     assert tracker.region is not None
@@ -135,7 +135,7 @@ def _sighting(acquired: Acquisition, sky: SkyModel) -> Sighting:
 def many_verified(  # type: ignore[no-untyped-def]
     direction, magnitude, like, stars, pairs, exhaustive, star, probability, posterior
 ):
-    """Identify many views of one zone; `like` has what they share."""
+    """Identify many views of one zone; `like` has the inputs that they share."""
     n = direction.shape[1]
     scratch, ledger = scratch_for(n), ledger_for(n)
     for k in range(len(direction)):
@@ -158,7 +158,7 @@ def many_verified(  # type: ignore[no-untyped-def]
 def many_votes(  # type: ignore[no-untyped-def]
     direction, magnitude, like, zone, polar, bounds, rules, ballots, star_of, tallies, star
 ):
-    """Count the votes of many views of one zone; `like` has what they share."""
+    """Count the votes of many views of one zone; `like` has the inputs that they share."""
     for k in range(len(direction)):
         ballots.votes[:] = 0
         ballots.counts[:] = 0
@@ -177,7 +177,7 @@ def many_votes(  # type: ignore[no-untyped-def]
 
 
 def _kernels(several: list[Sighting], named: dict[str, Rows]) -> dict[str, Callable[[], object]]:
-    """The three kernels on the views of one zone; each writes the rows it names to `named`."""
+    """Calls of three kernels for the views of one zone; each writes its rows to `named`."""
     like, stars, pairs = scene_of(several[0])
     direction = np.array([each.direction for each in several])
     magnitude = np.array([each.magnitude_mag for each in several])
@@ -216,7 +216,7 @@ def _kernels(several: list[Sighting], named: dict[str, Rows]) -> dict[str, Calla
 
 
 def measured(place: Place, views: int, seed: int, sky: SkyModel) -> Cost:
-    """The least time of several, kernel by kernel in turn, so that all meet the same machine."""
+    """Least time of several, with kernels in rotation under equal load."""
     total = dict.fromkeys((VOTES, EXHAUSTIVE, EARLY), 0.0)
     right = dict.fromkeys(total, 0)
     wrong = seen = 0
@@ -246,7 +246,7 @@ def measured(place: Place, views: int, seed: int, sky: SkyModel) -> Cost:
 
 
 def everywhere(quick: bool, seed: int) -> dict[str, Cost]:
-    """Every place, one after another."""
+    """Costs of all places."""
     sky, views = open_sky(), QUICK_VIEWS if quick else VIEWS
     return {
         name: measured(place, views, seed, sky)
@@ -255,7 +255,7 @@ def everywhere(quick: bool, seed: int) -> dict[str, Cost]:
 
 
 def bounds_of(costs: dict[str, Cost]) -> list[Bound]:
-    """Time, or times the votes; stars named rightly and wrongly."""
+    """Bounds of time, absolute or relative to votes, and of stars named rightly and wrongly."""
     bounds = []
     for name, cost in costs.items():
         bounds.append(at_most(f"{name}: stars named wrongly", cost.wrong, 0))
@@ -278,7 +278,7 @@ def bounds_of(costs: dict[str, Cost]) -> list[Bound]:
 
 
 def run(quick: bool, seed: int) -> Report:
-    """The benchmark: microseconds and ratios."""
+    """Benchmark of verified identification: microseconds and ratios."""
     costs = everywhere(quick, seed)
     figures = {
         f"{name}, {kernel}": (

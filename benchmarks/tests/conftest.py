@@ -1,4 +1,4 @@
-"""The seed of the benchmarks' tests, that of all tests where `pytest --seed` gives one."""
+"""Seed of the benchmarks' tests: that of `pytest --seed` if given."""
 
 import pytest
 

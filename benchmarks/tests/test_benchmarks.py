@@ -1,4 +1,4 @@
-"""The benchmarks run, on small samples, and find everything within its bounds."""
+"""Tests that all benchmarks run on small samples, and are within their bounds."""
 
 import json
 import re
@@ -43,7 +43,7 @@ def test_centroids_are_held_beside_photutils_and_sep(monkeypatch, seed):
 
 
 def test_the_mission_of_the_live_filter_differs_from_the_shipped_one_in_that_filter_alone(tmp_path):
-    """The service without the filter has the shipped mission."""
+    """The service without the filter uses the shipped mission."""
     mission = live_filter.mission_in(tmp_path)
     assert mission.live_filter is not None
     assert mission.model_copy(update={"live_filter": None}) == load_missions()["XTE"]
@@ -60,7 +60,7 @@ def test_a_benchmark_prints_its_figures(capsys):
 
 
 def test_the_solvers_benchmark_explains_itself(capsys):
-    """Its conditions have percent signs in their names."""
+    """The names of conditions contain percent signs, which argparse would interpret."""
     with pytest.raises(SystemExit) as stopped:
         lost_in_space(["--help"])
     assert stopped.value.code == 0
@@ -87,7 +87,7 @@ def test_the_verification_document_holds_every_section_at_full_size():
 
 
 def test_one_section_is_made_anew_and_the_others_are_kept(tmp_path, monkeypatch, seed):
-    """Each section carries its own seed; the verdict of the page is that of all its sections."""
+    """Each section has its own seed; the verdict of the page covers all its sections."""
     drawn = {"figure": "earliest"}
 
     def write(quick, seed):
@@ -179,7 +179,7 @@ def test_the_check_exits_with_one_exactly_where_it_names_a_stale_section(capsys,
     [(2, 2_000, True), (10, 2_000, False), (20, 20_000, True), (1, 20_000, False)],
 )
 def test_a_share_is_held_against_its_probability_on_both_sides(hits, of, holds):
-    """Five times as many suspect attitudes as expected are out of bounds, and so are too few."""
+    """Five times the expected number of suspect attitudes is out of bounds, and so are too few."""
     assert share_as_expected("suspect", hits, of, 0.001).holds is holds
 
 

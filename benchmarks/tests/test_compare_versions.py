@@ -1,4 +1,4 @@
-"""What `make compare` lets two versions differ in, and what it finds: each thing by itself."""
+"""Tests of `make compare`: permitted differences of two versions, and detected ones."""
 
 import copy
 import json
@@ -38,7 +38,7 @@ ANSWER = {
 
 
 def found(change, cached_counts=True, first=ANSWER):
-    """The paths at which an answer differs from itself after a change."""
+    """Paths of the differences between an answer and its changed copy."""
     second = copy.deepcopy(first)
     change(second)
     plain = [
@@ -138,7 +138,7 @@ def test_means_may_differ_as_sums_in_another_order_do():
 
 
 def test_a_reference_to_another_record_is_found():
-    """Ids are made anew by each server; which record they name is not."""
+    """Each server makes new ids, but they must name the same records."""
     shown = []
     for first, second, refers_to in ((ONE, TWO, ONE), (TWO, THREE, THREE)):
         plain = Plain(Names())
@@ -225,7 +225,7 @@ def test_what_the_base_does_not_have_is_an_addition():
 def test_differences_are_counted_and_kept_for_a_repeat(
     tmp_path, statuses, found, allow_additions, counted
 ):
-    """Also where neither server answered: nothing was compared then."""
+    """The count includes requests that neither server answered, since nothing was compared."""
     tally = Tally(tmp_path, allow_additions)
     request = Request("batch", "batch-1", "POST", "/x", b"\xff")
     received = tuple(Received(status, {}, b"late") for status in statuses)
@@ -285,7 +285,7 @@ SCHEMAS = "components/schemas"
 
 
 def changed(change):
-    """What is found of a change of the interface: additions, other differences."""
+    """Differences found after a change of the interface: additions, and other differences."""
     other = copy.deepcopy(INTERFACE)
     change(other)
     every = interface_differences(INTERFACE, other)

@@ -1,4 +1,4 @@
-"""The database that pages are measured on: as the writer would make it, never read whole."""
+"""Tests of the filled database: rows as from the writer, and no page that reads all of it."""
 
 import re
 

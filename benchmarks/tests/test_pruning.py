@@ -1,4 +1,4 @@
-"""The benchmark of pruning PostgreSQL, on a small sample."""
+"""Test of the pruning benchmark on PostgreSQL with a small sample."""
 
 import os
 import uuid
@@ -11,7 +11,7 @@ from benchmarks.speed.pruning import measured
 
 @pytest.fixture
 def schema():
-    """The URL of an empty schema of its own; skips where no server is named."""
+    """URL of a new, empty schema; skips the test if no server is named."""
     server = os.environ.get("TEST_POSTGRESQL_URL")
     if not server:
         pytest.skip("TEST_POSTGRESQL_URL names no PostgreSQL database to test on")

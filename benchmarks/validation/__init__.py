@@ -1,1 +1,1 @@
-"""Whether answers are right: docs/verification.md and the pages beside it."""
+"""Benchmarks of correct answers: docs/verification.md and further pages."""

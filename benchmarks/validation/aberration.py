@@ -1,4 +1,4 @@
-"""What aberration does to an attitude, three ways: corrected, applied upstream, ignored."""
+"""Effect of aberration on an attitude in three cases: corrected, applied upstream, ignored."""
 
 import math
 from typing import Any
@@ -18,10 +18,10 @@ from tests.reference import batches
 
 BATCHES, QUICK_BATCHES = 1000, 60
 WITHIN_ARCSEC = 0.5
-"""Noise adds a few hundredths of an arcsecond to a shift of sixteen."""
+"""Tolerance of the shift in arcseconds; noise adds a few hundredths to a shift of sixteen."""
 SAME_ARCSEC = 0.01
 NOISE = 0.15
-"""How far the mean error of a right attitude may be from that of its covariance, as a share."""
+"""Greatest relative difference of a right attitude's mean error from its covariance."""
 
 # How the stars are sent, what the batch says of them, and whether the attitude is then right.
 WAYS = {
@@ -33,7 +33,7 @@ WAYS = {
 
 
 def run(quick: bool, seed: int) -> Report:
-    """Mean pointing error across the boresight, beside the shift that aberration makes there."""
+    """Benchmark of mean pointing error across the boresight against the shift by aberration."""
     count = count_of(quick)
     passes = Passes("XTE", SkyModel(load_embedded(), LruCache(256 << 20)))
     boresight = passes.mission.trackers[0].body_from_tracker[:, 2]
@@ -81,7 +81,7 @@ def run(quick: bool, seed: int) -> Report:
 
 
 def write(quick: bool, seed: int) -> Written:
-    """The section of the verification."""
+    """Section of the verification about aberration."""
     report = run(quick, seed)
     text = f"""
 The same batches of an XTE in a low orbit sent four ways, {count_of(quick):,} each. Apparent
@@ -93,7 +93,7 @@ much as the covariance predicts; where it is not, the shift that it makes at the
 
 
 def count_of(quick: bool) -> int:
-    """Batches of one way."""
+    """Number of batches of each case."""
     return QUICK_BATCHES if quick else BATCHES
 
 

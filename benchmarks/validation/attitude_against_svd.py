@@ -1,4 +1,4 @@
-"""QUEST and TRIAD beside a singular value decomposition, over a million random cases."""
+"""QUEST and TRIAD against a singular value decomposition, over a million random cases."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -22,7 +22,7 @@ TRIAD, TRIAD_OFF = "TRIAD off in sigma, median", (0.1, 2.0)
 
 
 def blocks(count: int) -> Iterator[tuple[str, int, int]]:
-    """Kinds, numbers of stars and cases, `count` cases in all."""
+    """Kinds, numbers of stars, and sizes of blocks with `count` cases in total."""
     kinds = [
         (kind, n) for kind in ("half_turn", "narrow", "unequal", "wide") for n in (2, 3, 5, 12)
     ]
@@ -35,7 +35,7 @@ def blocks(count: int) -> Iterator[tuple[str, int, int]]:
 
 
 def run(quick: bool, seed: int) -> Report:
-    """The benchmark: worst and distribution of the differences, out of bounds or not."""
+    """Benchmark of the differences: worst, distribution, and bounds."""
     rng = np.random.default_rng(seed)
     count = QUICK_CASES if quick else CASES
     parts: list[tuple[str, int, Agreement]] = []
@@ -85,7 +85,7 @@ def summary(parts: list[tuple[str, int, Agreement]]) -> Report:
 
 
 def write(quick: bool, seed: int) -> Written:
-    """The section of the verification."""
+    """Section of the verification about attitudes."""
     report = run(quick, seed)
     text = f"""
 QUEST beside the attitude of a singular value decomposition, which needs no iteration: exact half

@@ -1,4 +1,4 @@
-"""Whether the probabilities mean what they say: of stars claimed at p a share p is right.
+"""Test of claimed probabilities: of stars claimed at p a share p must be right.
 
 python -m benchmarks calibration           every condition by itself
 python -m benchmarks calibration --quick   small samples
@@ -22,12 +22,12 @@ VIEWS, QUICK_VIEWS = 10_000, 120
 EDGES = (0.0, 0.5, 0.9, 0.99, 0.999, 1.0)
 NAMED, NAMED_WRONG = 0.999, 0.001
 OFF = 0.03
-"""How far the share that is right may lie below what was claimed, in the bins from .9 to .999."""
+"""Greatest deficit of the right share against the claimed one, in bins from .9 to .999."""
 FEW = 20
-"""Claims in a bin below which its share says nothing and has no bound."""
+"""Number of claims below which a bin has no bound."""
 
 TIMES_THE_VIEWS = {"two of five spurious": 2}
-"""Where fewer stars of a view can be named."""
+"""Factors on the number of views for conditions in which fewer stars can be named."""
 
 CONDITIONS = {
     "nominal errors": Condition(("cap", "band")),
@@ -44,7 +44,7 @@ CONDITIONS = {
 
 @dataclass(frozen=True)
 class Bin:
-    """Claims between two probabilities: what they claim on average, and how many are right."""
+    """Claims between two probabilities: mean claimed probability, and number of right claims."""
 
     least: float
     most: float
@@ -54,34 +54,34 @@ class Bin:
 
     @property
     def share(self) -> float:
-        """The share that is right."""
+        """Share of right claims."""
         return self.right / self.claims if self.claims else float("nan")
 
     @property
     def shown(self) -> str:
-        """Claims, and of them the share that is right."""
+        """Text of the number of claims and the share of right ones."""
         return f"{self.claims:,}: {self.share:.2%}" if self.claims else "-"
 
 
 @dataclass(frozen=True)
 class Reliability:
-    """The bins of one condition, and what is out of bounds in them."""
+    """Bins of one condition, and their bounds."""
 
     condition: str
     bins: tuple[Bin, ...]
 
     @property
     def named(self) -> Bin:
-        """The claims with which a star is named."""
+        """Bin of the claims at which a star is named."""
         return self.bins[-1]
 
     @property
     def wrong_at_most(self) -> float:
-        """The upper end of the 95 % interval of the share wrong among stars that are named."""
+        """Upper end of the 95 % interval of the share of wrong stars among named ones."""
         return interval(self.named.claims - self.named.right, self.named.claims)[1]
 
     def bounds(self, quick: bool) -> list[Bound]:
-        """Bounds of the condition; a small sample cannot tell the share of stars named wrongly."""
+        """Bounds of the condition; a small sample has none on the share of wrong names."""
         wrong = self.named.claims - self.named.right
         bounds = [
             at_most(f"{self.condition}: named wrongly", wrong, 0)
@@ -102,7 +102,7 @@ class Reliability:
 
 
 def claims(condition: Condition, views: int, seed: int) -> tuple[Vector, Vector]:
-    """The probability of every star's likeliest name, and whether that is right."""
+    """Probability of the likeliest name of every star, and whether it is right."""
     claimed, right = [], []
     for judged in judged_views(condition, views, seed):
         star, probability = judged.first()
@@ -113,7 +113,7 @@ def claims(condition: Condition, views: int, seed: int) -> tuple[Vector, Vector]
 
 
 def binned(name: str, claimed: Vector, right: Vector) -> Reliability:
-    """The claims of a condition by probability."""
+    """Claims of a condition, binned by probability."""
     bins = []
     for k, (least, most) in enumerate(pairwise(EDGES)):
         last = k == len(EDGES) - 2
@@ -125,7 +125,7 @@ def binned(name: str, claimed: Vector, right: Vector) -> Reliability:
 
 
 def measured(quick: bool, seed: int) -> list[Reliability]:
-    """Every condition by itself."""
+    """Bins of all conditions."""
     views = QUICK_VIEWS if quick else VIEWS
     return [
         binned(name, *claims(condition, views * TIMES_THE_VIEWS.get(name, 1), seed))
@@ -134,7 +134,7 @@ def measured(quick: bool, seed: int) -> list[Reliability]:
 
 
 def run(quick: bool, seed: int) -> Report:
-    """The benchmark: of each condition the claims and the share right, by bin."""
+    """Benchmark of the claims and right shares of each condition, by bin."""
     found = measured(quick, seed)
     figures = {
         f"{each.condition}, {part.least:g} to {part.most:g}": part.shown
@@ -149,12 +149,12 @@ def run(quick: bool, seed: int) -> Report:
 
 
 def bounds_of(found: list[Reliability], quick: bool) -> list[Bound]:
-    """The bounds of every condition."""
+    """Bounds of all conditions."""
     return [bound for each in found for bound in each.bounds(quick)]
 
 
 def write(quick: bool, seed: int) -> Written:
-    """The section of the verification, with its picture."""
+    """Section of the verification about probabilities, with its picture."""
     found = measured(quick, seed)
     rows = [
         (
@@ -202,7 +202,7 @@ end of the interval where no claim was wrong.
 
 
 def _draw(found: list[Reliability], pictures: Folder) -> None:
-    """How often claims were wrong over how often they say they are."""
+    """Draw the share of wrong claims over the claimed probability of error."""
     figure = pictures.figure(7.5, 5.0)
     axes = figure.subplots()
     axes.plot([1e-7, 1.0], [1e-7, 1.0], color="#888888", linewidth=0.8)

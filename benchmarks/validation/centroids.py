@@ -1,8 +1,8 @@
-"""Centroids of simulated stars: every method beside its own prediction, photutils and sep.
+"""Centroids of simulated stars: every method against its own prediction, photutils and sep.
 
-The same windows go to all.  Bounds: `matched` and `recursive` unbiased to 0.01 px and
-scattered within 15 % of the Cramér-Rao bound; every method's scatter within 10 % of what
-it predicts; without correction, the truncation bias of a moment as predicted.
+All methods get the same windows.  Bounds: `matched` and `recursive` unbiased to 0.01 px and
+scattered within 15 % of the Cramér-Rao bound; every method's scatter within 10 % of its prediction;
+without correction, the truncation bias of a moment as predicted.
 """
 
 import math
@@ -39,22 +39,22 @@ FITTED = ("matched", "recursive")
 MOST_BIAS_PX = 0.01
 MOST_TRUNCATION_PX = 1e-3
 MOST_US = 20_000.0
-"""A star by any own method: a thousand stars take less than half a minute."""
+"""Longest time in microseconds per star: a thousand stars take less than half a minute."""
 AS_TOLD = "scatter over what the method predicts"
 OVER_BOUND = "scatter of matched and recursive over the Cramér-Rao bound"
 BIAS = "bias of matched and recursive"
 BESIDE_PEERS = "scatter of matched over that of the best of photutils and sep"
 REFUSES = 0.98
-"""A method that takes less than this share of stars is shown more."""
+"""Share of accepted stars below which a method gets more stars."""
 MOST_DRAWN = 40
-"""At most so many times the stars for a method that refuses most of them."""
+"""Greatest factor on the number of stars for a method that refuses most of them."""
 WELL_KNOWN = 2.5
-"""So many times the stars are taken then: the ratio is known to 1.3 %, the refusals' pull shows."""
+"""Final factor on the number of stars: scatter to 1.3 %, with the bias by refusals visible."""
 Peer = Callable[[WindowStar], tuple[float, float]]
 
 
 def _square(star: WindowStar) -> tuple[Any, int, int]:
-    """The 9 x 9 pixels about the true place, as every method of ours sums, background off."""
+    """Background-free 9 x 9 pixels about the true position, as summed by the service's methods."""
     u, v = round(star.u_px), round(star.v_px)
     window = cutout(star.window.counts, u, v, HALF_WIDTH_PX, DETECTOR, BACKGROUND)
     return window.light_counts, window.corner_u_px, window.corner_v_px
@@ -73,7 +73,7 @@ def _photutils(way: Callable[[Any], Any]) -> Peer:
 
 
 def _sep(star: WindowStar) -> tuple[float, float]:
-    """SExtractor's windowed place, from the true pixel, with the FWHM that it asks for."""
+    """Windowed position by SExtractor, started at the true pixel with the required FWHM."""
     light = np.ascontiguousarray(star.window.light_counts)
     sigma = 2.355 / 2.355 * 1.1
     u, v, _ = sep.winpos(
@@ -94,7 +94,7 @@ COLUMNS = ["window", "scan", "matched", "its bias", "recursive", *PEERS]
 
 
 def bound_px(psf: Psf, peak_snr: float) -> float:
-    """The Cramér-Rao bound of u, averaged over where in its pixel a star may stand."""
+    """Cramér-Rao bound of u, averaged over the position of the star in its pixel."""
     flux = flux_of_peak(psf, peak_snr, DETECTOR, BACKGROUND)
     grid, gain = np.arange(-12.0, 13.0), DETECTOR.gain_e_per_count
     squares = []
@@ -107,7 +107,7 @@ def bound_px(psf: Psf, peak_snr: float) -> float:
 
 
 def rows(quick: bool, seed: int) -> tuple[list[list[object]], list[Bound], dict[str, float]]:
-    """Table rows, their bounds, and microseconds a star by method."""
+    """Table rows, their bounds, and microseconds per star by method."""
     number = 40 if quick else 600
     found_rows: list[list[object]] = []
     bounds: dict[str, list[Bound]] = {}
@@ -147,10 +147,10 @@ def _row(
     bound: float,
     spent: dict[str, float],
 ) -> tuple[list[object], list[tuple[str, Bound]]]:
-    """The cells of a row and its bounds, each with its kind.
+    """Cells of a row and its bounds, each with its kind.
 
-    A method that refuses most stars for too little light is shown `further` ones, until
-    its scatter is known as well as that of the others.
+    A method that refuses most stars for too little light gets `further` ones, until its scatter is
+    known as well as that of the other methods.
     """
     cells: list[object] = []
     bounds: list[tuple[str, Bound]] = []
@@ -201,7 +201,7 @@ def _row(
 
 
 def truncation(quick: bool) -> tuple[list[list[object]], list[Bound]]:
-    """Without noise and correction: the bias of a moment beside two predictions of it."""
+    """Bias of a moment without noise and correction, against two predictions of it."""
     found: list[list[object]] = []
     foretold: list[Bound] = []
     lawful: list[Bound] = []
@@ -232,7 +232,7 @@ def truncation(quick: bool) -> tuple[list[list[object]], list[Bound]]:
 
 
 def run(quick: bool, seed: int) -> Report:
-    """Scatter by method, with the time that a star takes."""
+    """Benchmark of centroids: scatter by method, and time per star."""
     found, bounds, spent = rows(quick, seed)
     cut, of_truncation = truncation(quick)
     head = COLUMNS
@@ -248,7 +248,7 @@ def run(quick: bool, seed: int) -> Report:
 
 
 def write(quick: bool, seed: int) -> Written:
-    """The section of the verification."""
+    """Section of the verification about centroids."""
     found, bounds, spent = rows(quick, seed)
     _, of_truncation = truncation(quick)
     head = ["image", "peak S/N", "bound (px)", *COLUMNS]

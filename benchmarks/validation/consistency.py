@@ -1,4 +1,4 @@
-"""What the consistency test of an attitude lets pass by its nature.
+"""Faults that the consistency test of an attitude cannot detect.
 
     python -m benchmarks consistency
 
@@ -27,49 +27,49 @@ Array = npt.NDArray[np.float64]
 
 CASES, QUICK_CASES = 4000, 300
 SIGMA_ARCSEC, RADIUS_DEG, BETWEEN_DEG = 2.1213203, 4.0, 60.0
-"""XTE's tracker; where there are two, their boresights are so far apart."""
+"""Star sigma and field radius of XTE's tracker, and angle between two trackers."""
 SUSPECT = 0.001
 AROUND_ARCSEC = 5.0
-"""So much more than a misalignment noise may add to the median error."""
+"""Greatest increase of the median error, in arcseconds, by noise beyond a misalignment."""
 FEW = 30
-"""Good attitudes below which their errors say nothing."""
+"""Number of good attitudes below which their errors have no bound."""
 NOISES, STARS = (1.0, 1.5, 2.0, 3.0), (2, 3, 5, 10)
 MISALIGNED_ARCSEC, STARS_EACH = (0.0, 10.0, 30.0, 60.0, 300.0), (1, 2, 5)
 
 
 @dataclass(frozen=True)
 class Row:
-    """One kind of batch: of so many how many were good, how many should be, and their errors."""
+    """Kind of batch: numbers of solved and of good ones, expected share, and errors."""
 
     label: tuple[str, str, str]
     solved: int
     good: int
     expected: float
     squares: list[float]
-    """Of the good ones e^T P^-1 e."""
+    """Values of e^T P^-1 e of the good attitudes."""
     error_arcsec: float
-    """Median angle of the error of the good ones, about all axes."""
+    """Median error angle of the good attitudes, about all axes."""
     noise: float
     off_arcsec: float
 
     @property
     def name(self) -> str:
-        """The row in one line."""
+        """Name of the row in one line."""
         return ", ".join(self.label)
 
     @property
     def error_sigma(self) -> float:
-        """Root mean square error over its sigma: 1 where the covariance tells the truth."""
+        """Root mean square error over its sigma; 1 if the covariance is right."""
         return math.sqrt(float(np.mean(self.squares)) / 3.0)
 
     @property
     def passing(self) -> Bound:
-        """As many are good as chi-square says."""
+        """Bound of the number of good attitudes by chi-square."""
         return share_as_expected(f"{self.name}: good", self.good, self.solved, self.expected)
 
     @property
     def error(self) -> Bound:
-        """Noise enlarges the error as it should; a misalignment moves the attitude no further."""
+        """Bound of the error: enlarged as the noise, or limited by the misalignment."""
         if self.off_arcsec > 0.0:
             label = f"{self.name}: median error"
             return at_most(label, self.error_arcsec, self.off_arcsec + AROUND_ARCSEC, "arcsec")
@@ -79,7 +79,7 @@ class Row:
 
 
 def noisy(noise: float, stars: int, count: int, rng: np.random.Generator) -> Row:
-    """One tracker whose stars scatter by more than they are told to."""
+    """Row of one tracker whose stars have more noise than their sigmas."""
     freedom = 2 * stars - 3
     expected = float(chi2.cdf(chi2.isf(SUSPECT, freedom) / noise**2, freedom))
     label = ("one tracker", f"{stars} stars", f"noise {noise:g} times as told")
@@ -88,7 +88,7 @@ def noisy(noise: float, stars: int, count: int, rng: np.random.Generator) -> Row
 
 
 def misaligned(off_arcsec: float, stars: int, count: int, rng: np.random.Generator) -> Row:
-    """Two trackers with as many stars each, the second one turned about any axis."""
+    """Row of two trackers with as many stars each, the second rotated about a random axis."""
     freedom = 4 * stars - 3
     point = float(chi2.isf(SUSPECT, freedom))
     found, expected = [], []
@@ -111,7 +111,7 @@ def misaligned(off_arcsec: float, stars: int, count: int, rng: np.random.Generat
 def _solved(
     rng: np.random.Generator, stars: tuple[int, ...], noise: float, off_arcsec: float
 ) -> tuple[AttitudeSolution | None, Array]:
-    """The attitude of random stars, and its error; the truth is that body and inertial agree."""
+    """Attitude of random stars, and its error; the true attitude is the identity."""
     parts, seen = [], []
     for place, number in enumerate(stars):
         tilt = math.radians(BETWEEN_DEG * place)
@@ -161,7 +161,7 @@ def _row(
 
 
 def measured(quick: bool, seed: int) -> list[Row]:
-    """Every row."""
+    """Rows of all kinds."""
     count, rng = QUICK_CASES if quick else CASES, np.random.default_rng(seed)
     rows = [noisy(noise, stars, count, rng) for noise in NOISES for stars in STARS]
     return rows + [
@@ -170,7 +170,7 @@ def measured(quick: bool, seed: int) -> list[Row]:
 
 
 def run(quick: bool, seed: int) -> Report:
-    """The benchmark: how often each kind passes, beside how often it should."""
+    """Benchmark of the share of good attitudes of each kind against the expected one."""
     rows = measured(quick, seed)
     figures = {
         row.name: f"good {row.good / row.solved:.1%}, expected {row.expected:.1%}" for row in rows
@@ -179,7 +179,7 @@ def run(quick: bool, seed: int) -> Report:
 
 
 def bounds_of(rows: list[Row]) -> list[Bound]:
-    """The bounds of all rows; errors only where enough attitudes are good."""
+    """Bounds of all rows; errors only in rows with enough good attitudes."""
     return [
         *every("rows with as many good as chi-square foresees", [row.passing for row in rows]),
         *every(
@@ -190,7 +190,7 @@ def bounds_of(rows: list[Row]) -> list[Bound]:
 
 
 def write(quick: bool, seed: int) -> Written:
-    """The section of the verification."""
+    """Section of the verification about consistency."""
     rows = measured(quick, seed)
     text = f"""
 The status `suspect` is a test of whether the stars agree with one another: TASTE beyond the 99.9 %
@@ -212,7 +212,7 @@ states (1 where that is true), and the median error about all axes in arcsec.
 
 
 def _table(rows: list[Row], trackers: str) -> str:
-    """A row for what is wrong, a column for each number of stars."""
+    """Table with a row for each fault, and a column for each number of stars."""
     cells: dict[str, list[str]] = {}
     shown = [row for row in rows if row.label[0] == trackers]
     for row in shown:

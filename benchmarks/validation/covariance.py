@@ -1,7 +1,7 @@
-"""Whether errors scatter as the covariance says, through the whole pipeline.
+"""Test of the covariance against the scatter of errors, through the whole pipeline.
 
-Batches of apparent star directions with two-axis Gaussian noise, seen from a
-spacecraft in orbit; the solved attitude is held against the true one.
+Batches of apparent star directions with two-axis Gaussian noise, seen from a spacecraft in orbit;
+the solved attitude is compared with the true one.
 """
 
 import json
@@ -36,9 +36,9 @@ PRIORS = 40
 MOMENT = "1996-01-10T12:00:00.000Z"
 VELOCITY_KM_PER_S = (0.0, 6.4, -4.1)
 SQUARES = {2.366: 0.5, 7.815: 0.05, 14.16: 0.0027}
-"""Chi-square of three degrees of freedom passes these with these probabilities."""
+"""Values of chi-square with three degrees of freedom, and the probabilities to exceed them."""
 SUSPECT = 0.001
-"""TASTE of a sound attitude passes its 99.9 % point with this probability."""
+"""Probability of a correct attitude's TASTE to exceed its 99.9 % point."""
 LEAST_SOLVED = 0.99
 
 
@@ -62,7 +62,7 @@ class Passes:
         return np.asarray((earth + np.array(VELOCITY_KM_PER_S) * 1000.0) / erfa.CMPS)
 
     def _apparent(self) -> Array:
-        """Lorentz-transformed directions, written out: not the service's own correction."""
+        """Lorentz-transformed directions, without the service's own correction."""
         v = self.velocity_c
         inverse_gamma = math.sqrt(1.0 - v @ v)
         along = (self.directions @ v)[:, None]
@@ -72,7 +72,7 @@ class Passes:
     def draw(
         self, rng: np.random.Generator, prior: Array, directions: Array, aberration: str
     ) -> tuple[Array, Acquisition]:
-        """One batch about an a priori attitude: its true attitude and what was made of it."""
+        """Batch about an a priori attitude: its true attitude and its result."""
         band = self.toml["zone"]["kind"] == "band"
         error = batches.rotation(rng.normal(size=3), rng.uniform(0, 0.1 if band else 3.0))
         if band:
@@ -120,7 +120,7 @@ def error_of(truth: Array, found: Acquisition) -> Array | None:
 
 
 def run(quick: bool, seed: int) -> Report:
-    """The benchmark: every mission and solver, errors in units of the covariance and TASTE."""
+    """Benchmark of every mission and solver: errors in units of the covariance, and TASTE."""
     count = count_of(quick)
     sky = SkyModel(load_embedded(), LruCache(256 << 20))
     figures: dict[str, Any] = {}
@@ -165,7 +165,7 @@ def _bounds(
     freedoms: list[int],
     suspect: int,
 ) -> list[Bound]:
-    """What a mission's attitudes are held against: chi-square on both sides."""
+    """Bounds of a mission's attitudes, by chi-square on both sides."""
     solved = len(tastes)
     return [
         at_least(f"{label}: batches with an attitude", solved / count, LEAST_SOLVED),
@@ -190,7 +190,7 @@ def _bounds(
 
 
 def write(quick: bool, seed: int) -> Written:
-    """The section of the verification."""
+    """Section of the verification about covariances."""
     report = run(quick, seed)
     text = f"""
 Nominal batches of up to five stars with two-axis Gaussian noise, through the whole pipeline:
@@ -204,7 +204,7 @@ SWAS), or by up to 0.1 deg and any angle about the pole (SOHO). {count_of(quick)
 
 
 def count_of(quick: bool) -> int:
-    """Batches of one mission."""
+    """Number of batches of one mission."""
     return QUICK_BATCHES if quick else BATCHES
 
 

@@ -58,10 +58,10 @@ Errors = dict[str, list[float]]
 
 @dataclass
 class CrossedFrame:
-    """What came of one frame: all of the core, and places by each method.
+    """Result of one frame: figures of the core, and positions by each method.
 
-    `errors` are errors of stars that stand alone over their sigmas, along u and v; those of a
-    camera that knows nothing of the wires are in `naive_errors_px`, in pixels.
+    `errors` are errors along u and v of separate stars over their sigmas.  `naive_errors_px` are
+    those of a camera without a model of the wires, in pixels.
     """
 
     whole: Measured
@@ -77,7 +77,7 @@ def _sky() -> SkyModel:
 
 
 def mission_with(psf: PsfKind) -> Mission:
-    """The shipped mission with another image of a star."""
+    """Shipped mission with another point spread function."""
     mission = load_missions()[SPACECRAFT]
     tracker, camera = mission.camera_tracker(None, "tracker")
     other = tracker.model_copy(update={"camera": camera.model_copy(update={"psf": psf})})
@@ -85,12 +85,12 @@ def mission_with(psf: PsfKind) -> Mission:
 
 
 def run(quick: bool, seed: int) -> Report:
-    """The benchmark among the others."""
+    """Benchmark of frames behind crossed wires."""
     return measured_report(QUICK_FRAMES if quick else FRAMES, seed, os.cpu_count() or 1)
 
 
 def measured_report(frames: int, seed: int, processes: int) -> Report:
-    """All figures, and what is out of bounds."""
+    """All figures, and their bounds."""
     starts = range(0, frames, CHUNK)
     tasks = [(seed, frames, list(range(k, min(k + CHUNK, frames)))) for k in starts]
     found: list[CrossedFrame] = []
@@ -132,7 +132,7 @@ def _measured(drawn: DrawnFrame, mission: Mission, compared: bool) -> CrossedFra
 def _placed(
     drawn: DrawnFrame, mission: Mission, methods: Sequence[CentroidMethod]
 ) -> dict[str, tuple[int, np.ndarray]]:
-    """By method: stars missed or without a place, and of those that stand alone the errors.
+    """Number of stars missed or without position, and errors of separate stars, by method.
 
     Errors in u and v and their sigmas, (n, 4) in pixels.
     """
@@ -205,13 +205,13 @@ def _report(found: Sequence[CrossedFrame]) -> Report:
 
 
 def _slack(errors: int) -> tuple[float, float]:
-    """The bounds, and four standard errors where there are few."""
+    """Limits of the spread, wider by four standard errors if there are few errors."""
     more = max(0.0, 4.0 / np.sqrt(2.0 * errors) - 0.1)
     return SPREAD[0] - more, SPREAD[1] + more
 
 
 def _naive(found: Sequence[CrossedFrame]) -> dict[str, object]:
-    """The same by a camera that takes its stars for Gaussian."""
+    """Figures of a camera that takes its stars for Gaussian."""
     compared = [each for each in found if each.naive_errors_px is not None]
     stars = sum(each.naive_stars for each in compared)
     missed = sum(each.naive_missed or 0 for each in compared)
@@ -225,7 +225,7 @@ def _naive(found: Sequence[CrossedFrame]) -> dict[str, object]:
 
 
 def document(report: Report, seed: int) -> str:
-    """The section of docs/frames.md."""
+    """Section of docs/frames.md."""
     verdict = "Everything is within its bounds." if report.passed else "**Out of bounds.**"
     record = record_of(SOURCES)
     frames = report.figures["frames"]

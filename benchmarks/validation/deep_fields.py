@@ -1,4 +1,4 @@
-"""Fields of many stars, most of them outside the zone, by verified identification.
+"""Verified identification in fields of many stars, most of them outside the zone.
 
 python -m benchmarks deep_fields
 """
@@ -25,15 +25,15 @@ from studies.paper_1994.views import EPOCH, batch_of, draw_zone, paper_mission
 FIELDS, QUICK_FIELDS = 30, 4
 STARS = (10, 30, 100, 250)
 FAINTEST_MAG = 7.5
-"""The faintest stars drawn: the catalog may lack fainter ones, which then stay unmatched."""
+"""Magnitude of the faintest drawn stars: the catalog may lack fainter ones."""
 LEAST_RIGHT, LEAST_FIELDS = 0.97, 0.98
 
 
 @dataclass(frozen=True)
 class Found:
-    """Fields of one number of stars, and the stars of them that lie in the zone.
+    """Fields with one number of stars, and their stars within the zone.
 
-    `fields_named` have more than half of these named.
+    `fields_named` counts the fields with more than half of these stars named.
     """
 
     stars: int
@@ -45,7 +45,7 @@ class Found:
 
 
 def measured(stars: int, fields: int, seed: int, step: Callable[[int], object] = int) -> Found:
-    """Fields anywhere along the band of SOHO, of the stars nearest to the boresight."""
+    """Fields along the band of SOHO, each of the stars nearest to its boresight."""
     sky, mission = SkyModel(load_embedded(), LruCache(512 << 20)), paper_mission("SOHO")
     catalog = sky.run_catalog(mission, EPOCH)
     run = the_paper().runs_of([3])[0]
@@ -99,7 +99,7 @@ def _measured(quick: bool, seed: int) -> tuple[list[Found], list[Bound]]:
 
 
 def run(quick: bool, seed: int) -> Report:
-    """The benchmark: shares right and wrong."""
+    """Benchmark of deep fields: shares named rightly and wrongly."""
     found, bounds = _measured(quick, seed)
     figures: dict[str, object] = {
         f"{each.stars} stars": f"{each.right:,} of {each.inside:,} rightly, {each.wrong} wrongly"
@@ -109,7 +109,7 @@ def run(quick: bool, seed: int) -> Report:
 
 
 def write(quick: bool, seed: int) -> Written:
-    """The section of the verification."""
+    """Section of the verification about deep fields."""
     found, bounds = _measured(quick, seed)
     rows = [
         [

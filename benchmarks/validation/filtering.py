@@ -1,6 +1,6 @@
 """Filter and smoother of attitude and gyro bias over simulated passes of three hours.
 
-Held against Farrenkopf's steady state, and against their own covariances over many runs.
+Results are compared with Farrenkopf's steady state, and with their own covariances over many runs.
 """
 
 import math
@@ -53,16 +53,17 @@ INSIDE = (
     "scatter by .003, .009 and .035 (one sigma, 80 simulations of 200 runs)"
 )
 SINGLE, QUICK_SINGLE = 0.016, 0.10
-"""How far the share of single runs may be off .95: five of the sigmas that exact filters have."""
+"""Greatest difference of the share of single runs from .95: five sigmas of exact filters."""
 OFF, QUICK_OFF = 0.08, 0.33
-"""How far the mean of NEES/6 may be off 1: five of the .016 that exact filters have, 200 runs."""
+"""Greatest difference of the mean of NEES/6 from 1: five sigmas of exact filters, 200 runs."""
 RMS_PERCENT, QUICK_RMS_PERCENT = 11.5, 46.0
-"""How far an rms error may be off its sigma: five of the 2.3 % that its correlation leaves.
+"""Greatest difference in percent of an rms error from its sigma: five standard errors.
 
-Of the second case's closed loop, whose squared errors last 730 s, over the last hour of 200 runs.
+The standard error of 2.3 % is that of the second case's closed loop, whose squared errors last 730
+s, over the last hour of 200 runs.
 """
 CHECKED_S = (600, 3600, HOURS * 3600)
-"""Epochs at which the sum over the runs, which are independent, is held against chi-square."""
+"""Epochs at which the sum over the independent runs is compared with chi-square."""
 SIGMA_V, SIGMA_U = math.sqrt(10.0) * 1e-7, math.sqrt(10.0) * 1e-10
 SOURCES = (
     "service/features/definitive/kernels",
@@ -75,10 +76,10 @@ SOURCES = (
 
 @dataclass(frozen=True)
 class Case:
-    """Trackers of `sigmas_arcsec` about x, y, z measure every `every_s`; the gyro gives 1 Hz.
+    """Case: trackers with `sigmas_arcsec` about x, y, z measure every `every_s`; gyro at 1 Hz.
 
-    A case with `gap` has no tracker for 600 s before the last hour.  `largest_ratio` bounds
-    the smoothed variance over the filtered one.
+    A case with `gap` has no tracker for 600 s before the last hour.  `largest_ratio` bounds the
+    ratio of the smoothed to the filtered variance.
     """
 
     name: str
@@ -91,7 +92,7 @@ class Case:
 
     @property
     def steady(self) -> bool:
-        """Whether Farrenkopf's solution holds."""
+        """True if Farrenkopf's solution is valid."""
         return not (self.gap or self.errors)
 
 
@@ -114,7 +115,7 @@ CASES = (
 
 @dataclass
 class Measured:
-    """What the runs of one case gave; sigmas and errors in arcsec about x, y, z."""
+    """Results of the runs of one case; sigmas and errors in arcsec about x, y, z."""
 
     case: Case
     nees: list[Array] = field(default_factory=list)
@@ -128,9 +129,9 @@ class Measured:
     starts: int = 0
 
     def share_inside(self, values: Sequence[Array], degrees: int, runs: int | None = None) -> float:
-        """The share of epochs at which the mean over so many runs lies in its 95 % region.
+        """Share of epochs whose mean over groups of runs is within its 95 % region.
 
-        Without `runs` it is the mean over all of them.
+        Without `runs` the mean is over all runs.
         """
         runs = runs or len(values)
         low, high = chi2.ppf([0.025, 0.975], degrees * runs) / runs
@@ -140,7 +141,7 @@ class Measured:
 
 
 def run_case(case: Case, runs: int, rng: np.random.Generator) -> Measured:
-    """All runs of one case: the same motion, other noise."""
+    """Results of all runs of one case: the same motion with different noise."""
     rate = simulated.slews if case.errors else simulated.inertial_hold
     truth = simulated.truth_of(rate, HOURS * 3600.0)
     rows = np.arange(0, HOURS * 3600 + 1, case.every_s)
@@ -157,7 +158,7 @@ def run_case(case: Case, runs: int, rng: np.random.Generator) -> Measured:
 def one_run(
     case: Case, truth: Any, rows: npt.NDArray[np.int64], rng: np.random.Generator, found: Measured
 ) -> None:
-    """Filter and smooth one pass, and put its figures to the others."""
+    """Filter and smooth one pass, and append its figures to the results."""
     errors = simulated.random_errors(case.model, rng) if case.errors else None
     gyro, bias = simulated.gyro_of(truth, case.model, rng, errors=errors)
     if errors is not None:
@@ -182,12 +183,12 @@ def one_run(
 
 
 def variances(history: AttitudeHistory) -> Array:
-    """Variances (n, 3) about the body axes in arcsec^2, without what single rejections add."""
+    """Variances (n, 3) about the body axes in arcsec^2, without additions by single rejections."""
     return np.asarray(np.diagonal(history.model_covariance, axis1=1, axis2=2)[:, :3] / ARCSEC**2)
 
 
 def bounds_of(found: Measured, quick: bool) -> list[Bound]:
-    """The bounds of one case; those of a few runs are wider, as chance is."""
+    """Bounds of one case; wider with a few runs."""
     case, name = found.case, found.case.name
     off, single = (QUICK_OFF, QUICK_SINGLE) if quick else (OFF, SINGLE)
     least = 1.0 - off if not case.errors else 0.3
@@ -261,13 +262,13 @@ def steady_of(case: Case) -> Array:
 
 
 def measured(quick: bool, seed: int) -> list[Measured]:
-    """Every case."""
+    """Results of all cases."""
     rng = np.random.default_rng(seed)
     return [run_case(case, QUICK_RUNS if quick else RUNS, rng) for case in CASES]
 
 
 def run(quick: bool, seed: int) -> Report:
-    """The benchmark: accuracy and consistency of filter and smoother."""
+    """Benchmark of the accuracy and consistency of filter and smoother."""
     cases = measured(quick, seed)
     figures: dict[str, Any] = {HEAD: ", ".join(COLUMNS)}
     figures |= {each.case.name: ", ".join(row_of(each)[1:]) for each in cases}
@@ -280,7 +281,7 @@ def run(quick: bool, seed: int) -> Report:
 
 
 def day_s(seed: int) -> float:
-    """Seconds to filter and smooth a day of gyro samples and attitudes at 1 Hz, compiled before."""
+    """Seconds to filter and smooth a day of gyro samples and attitudes at 1 Hz, precompiled."""
     rng = np.random.default_rng(seed)
     truth = simulated.truth_of(simulated.orbital_rate, float(DAY_S))
     gyro, _ = simulated.gyro_of(truth, FINE, rng)
@@ -292,7 +293,7 @@ def day_s(seed: int) -> float:
 
 
 def row_of(found: Measured) -> tuple[str, ...]:
-    """A row of the table."""
+    """Row of the table for one case."""
     filtered, smoothed = (
         np.sqrt(np.mean(np.square(errors), axis=(0, 1)))
         for errors in (found.errors, found.smoothed_errors)
@@ -313,13 +314,13 @@ def row_of(found: Measured) -> tuple[str, ...]:
 
 
 def _inside(found: Measured, values: Sequence[Array], degrees: int) -> str:
-    """Both shares of epochs inside; see `INSIDE`."""
+    """Text of the shares of epochs within their regions; see `INSIDE`."""
     shares = (found.share_inside(values, degrees, runs) for runs in (1, GROUP, None))
     return " / ".join(f"{share:.3f}" for share in shares)
 
 
 def write(quick: bool, seed: int) -> Written:
-    """The section of the verification."""
+    """Section of the verification about filtering."""
     cases = measured(quick, seed)
     text = f"""
 Passes of {HOURS} h at rest (the last case: slews of 65 deg) are measured by a gyro at 1 Hz

@@ -55,11 +55,11 @@ REPEATS = 5
 PRIORS = ("within 1 deg", "none")
 
 FOUND_PX = 2.0
-"""A candidate this near to a star's true place is that star."""
+"""Greatest distance in pixels between a candidate and the true position of its star."""
 SEPARATE_PX = 3.0
-"""A brighter star nearer than this hides a star: both are one image."""
+"""Distance in pixels below which a brighter star hides a star: both are one image."""
 RIGHT_ARCSEC = (30.0, 30.0, 300.0)
-"""About the frame's axes and its boresight: beyond it an attitude is wrong."""
+"""Greatest error of a right attitude about the frame's axes and its boresight."""
 
 COMPLETE_LEAST = 0.999
 RIGHT_LEAST = 0.995
@@ -68,7 +68,7 @@ DETECTION_MOST = 1.5
 
 DOCUMENT = ROOT / "docs" / "frames.md"
 CROSSED = "\n<!-- crossed wires -->\n"
-"""Behind this line of the page stands what `crossed_frames` writes."""
+"""Line of the page before the section that `crossed_frames` writes."""
 PICTURE = ROOT / "docs" / "images" / "overlay.png"
 
 
@@ -77,7 +77,7 @@ SOURCES = (*CORE, *IMAGING, "service/simulate/frames.py")
 
 @dataclass
 class Solved:
-    """What became of one frame with one kind of a priori knowledge."""
+    """Result of one frame with one kind of a priori knowledge."""
 
     attitude: bool = False
     suspect: bool = False
@@ -86,16 +86,16 @@ class Solved:
     misnamed: int = 0
     identify_us: int = 0
     normalised: list[float] = field(default_factory=list)
-    """Errors about the three axes, each over its predicted sigma."""
+    """Errors about the three axes over their predicted sigmas."""
     square: float = 0.0
-    """e^T P^-1 e of the attitude."""
+    """Value of e^T P^-1 e of the attitude."""
     taste: float = 0.0
     freedom: int = 0
 
 
 @dataclass
 class Measured:
-    """What came of one frame."""
+    """Result of one frame."""
 
     stars: int
     hidden: int
@@ -103,19 +103,19 @@ class Measured:
     false: int
     used: int
     placed: list[tuple[float, float, float]]
-    """Of each star by itself: error in u and v over sigma, and the magnitude's error."""
+    """Errors of each separate star: u and v over sigma, and magnitude."""
     steps_us: Mapping[str, int]
     solved: Mapping[str, Solved]
     ratio: float | None = None
 
 
 def run(quick: bool, seed: int) -> Report:
-    """The benchmark among the others."""
+    """Benchmark of frames."""
     return measured_report(QUICK_FRAMES if quick else FRAMES, seed, os.cpu_count() or 1)
 
 
 def measured_report(frames: int, seed: int, processes: int) -> Report:
-    """All figures, and what is out of bounds."""
+    """All figures, and their bounds."""
     starts = range(0, frames, CHUNK)
     tasks = [(seed, frames, list(range(k, min(k + CHUNK, frames)))) for k in starts]
     found: list[Measured] = []
@@ -184,7 +184,7 @@ _TRUTH = ("u_px", "v_px", "magnitude")
 
 
 def _hidden(u: Any, v: Any, magnitude: Any) -> Any:
-    """Stars whose image is part of a brighter one's."""
+    """Mask of the stars whose image is part of a brighter one's."""
     near = np.hypot(u - u[:, None], v - v[:, None]) < SEPARATE_PX
     brighter = magnitude[None, :] < magnitude[:, None]
     return (near & brighter).any(axis=1)
@@ -193,7 +193,7 @@ def _hidden(u: Any, v: Any, magnitude: Any) -> Any:
 def _against_truth(
     used: Sequence[Mapping[str, Any]], u: Any, v: Any, magnitude: Any
 ) -> tuple[list[tuple[float, float, float]], int]:
-    """Normalised errors of the stars that stand alone, and how many are no star at all."""
+    """Normalised errors of separate stars, and number of detections without a true star."""
     placed, false = [], 0
     for star in used:
         away = np.hypot(u - star["u_px"], v - star["v_px"])
@@ -248,7 +248,7 @@ def _solved(
 def _misnamed(
     acquisition: Acquisition, drawn: DrawnFrame, used: Sequence[Mapping[str, Any]]
 ) -> int:
-    """Stars named with certainty whose name stands nowhere near on the true frame."""
+    """Number of stars identified as unique whose true position is far away."""
     (tracker,) = acquisition.trackers
     names = {star["id"]: (star["u_px"], star["v_px"]) for star in drawn.truth["stars"]}
     wrong = 0
@@ -262,7 +262,7 @@ def _misnamed(
 
 
 def _ratio_to_sep(frame: Frame, camera: Camera) -> float:
-    """Processor time of our detection over SEP's own on the same frame, the least of several."""
+    """Processor time of the service's detection over SEP's on the same frame, least of several."""
     import sep
 
     ours, theirs = [], []
@@ -368,7 +368,7 @@ def _add_times(figures: dict[str, Any], bounds: list[Bound], found: Sequence[Mea
 
 
 def document(report: Report, seed: int) -> str:
-    """docs/frames.md."""
+    """Text of docs/frames.md."""
     verdict = "Everything is within its bounds." if report.passed else "**Out of bounds.**"
     lost = ", and once more lost in space" if f"prior {PRIORS[1]}: none" in report.figures else ""
     record = record_of(SOURCES)
@@ -404,7 +404,7 @@ hundred sigmas, and far less than any false star would move it by.
 
 
 def picture(seed: int, frames: int) -> bytes:
-    """The overlay of the first frame."""
+    """Image of the first frame's overlay."""
     sky, mission = _house()
     tracker, camera = mission.camera_tracker(None, "tracker")
     (drawn,) = draw_frames(mission, sky, FrameSettings(frames=frames, seed=seed), [0])

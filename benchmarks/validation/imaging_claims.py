@@ -1,4 +1,4 @@
-"""The systems IM-1 to IM-11 of the star image detection report, every claim within its bounds."""
+"""Claims of the systems IM-1 to IM-11 of the star image detection report, with their bounds."""
 
 from benchmarks.bounds import Bound, every
 from benchmarks.record import IMAGING
@@ -33,7 +33,7 @@ HELD_AGAINST = (
      "drawn stars; see [frames](frames.md#frames-behind-crossed-wires)", _FRAMES,
      "test_places_scatter_as_they_say"),
 )  # fmt: skip
-"""What the report only names: the second way to the same number, and the test that takes it."""
+"""Second ways to figures that the report only mentions, and the tests that use them."""
 
 
 def _rows(quick: bool, seed: int) -> list[Row]:
@@ -44,7 +44,7 @@ def _rows(quick: bool, seed: int) -> list[Row]:
 
 
 def run(quick: bool, seed: int) -> Report:
-    """Claims within their bounds by row."""
+    """Benchmark of the number of claims within their bounds by row."""
     measured = _rows(quick, seed)
     figures = {
         f"{row.name} {row.title}": f"{sum(c.holds for c in row.claims)} of {len(row.claims)}"
@@ -54,7 +54,7 @@ def run(quick: bool, seed: int) -> Report:
 
 
 def bounds_of(measured: list[Row]) -> list[Bound]:
-    """Every claim is checked where it is measured; the bound of a row is that all hold."""
+    """Bounds of all rows: all claims of a row hold."""
     return [
         bound
         for row in measured
@@ -66,7 +66,7 @@ def bounds_of(measured: list[Row]) -> list[Bound]:
 
 
 def write(quick: bool, seed: int) -> Written:
-    """The section of the verification: the claims that hold, counted by system."""
+    """Section of the verification: the claims that hold, counted by system."""
     measured = _rows(quick, seed)
     text = f"""
 What the star image detection report claims, system by system; [imaging.md](imaging.md) has every

@@ -1,4 +1,4 @@
-"""All 94 runs of Fink & Shoup's Tables 2 to 10, by votes beside 1994 and verified beside the votes.
+"""All 94 runs of Fink & Shoup's Tables 2 to 10: votes against 1994, verified against votes.
 
     python -m benchmarks paper_runs
 
@@ -34,19 +34,19 @@ from studies.paper_1994.tally import (
 
 STARS, QUICK_STARS = 20_000, 400
 SEEDS = 3
-"""Of the votes three seeds are pooled, of the verified identification the first is shown."""
+"""Number of seeds pooled for votes; verified identification shows the first seed only."""
 LEAST_INSIDE, LEAST_AGREE = 85, 0.98
 MOST_WRONG, MOST_WRONG_OF_RUN_PCT = 1e-5, 0.05
 MOST_OPEN_PCT, NOISY_PCT, DESERT_PCT = 0.5, 1.0, 1.5
 NOISY_ARCSEC, NOISY_MAG = 9.0, 0.3
-"""Three times the nominal noise."""
+"""Noise of a noisy run: three times the nominal noise."""
 BAD_ARCSEC = 85.0 * 3600.0
 FOOT_PCT = 2e-3
-"""Less is drawn there."""
+"""Least percentage that is drawn."""
 
 
 def most_open_pct(run: Run) -> float:
-    """How many stars of a run verified identification may leave ambiguous or unmatched."""
+    """Greatest percentage of stars that verified identification may leave open in a run."""
     if run.table == "9D" and max(run.rotation_arcsec) > BAD_ARCSEC:
         return DESERT_PCT
     noisy = run.sigma_arcsec >= NOISY_ARCSEC or run.sigma_mag >= NOISY_MAG
@@ -54,17 +54,17 @@ def most_open_pct(run: Run) -> float:
 
 
 def open_pct(tally: Tally) -> float:
-    """Stars ambiguous or unmatched."""
+    """Percentage of ambiguous and unmatched stars."""
     return 100.0 * (tally.total(AMBIGUOUS) + tally.total(UNMATCHED)) / tally.stars
 
 
 def wrong_pct(tally: Tally) -> float:
-    """Stars misidentified."""
+    """Percentage of misidentified stars."""
     return 100.0 * tally.total(MISIDENTIFIED) / tally.stars
 
 
 def bounds_of(votes: Sequence[Tally], verified: Sequence[Tally], quick: bool) -> list[Bound]:
-    """The bounds of all runs; of a small sample only what it can tell."""
+    """Bounds of all runs; fewer for a small sample."""
     stars = sum(tally.stars for tally in verified)
     wrong = sum(tally.total(MISIDENTIFIED) for tally in verified)
     allowed = max(int(MOST_WRONG * stars), 1 if quick else 0)
@@ -96,7 +96,7 @@ def bounds_of(votes: Sequence[Tally], verified: Sequence[Tally], quick: bool) ->
 
 
 def measured(quick: bool, seed: int) -> tuple[list[Tally], list[Tally], list[int]]:
-    """The tallies by votes and verified, and the seeds."""
+    """Tallies by votes, verified tallies, and the seeds."""
     stars = QUICK_STARS if quick else STARS
     seeds = [seed + k for k in range(1 if quick else SEEDS)]
     runs = the_paper().runs_of(list(TITLES))
@@ -105,7 +105,7 @@ def measured(quick: bool, seed: int) -> tuple[list[Tally], list[Tally], list[int
 
 
 def run(quick: bool, seed: int) -> Report:
-    """The benchmark: what all runs have in common."""
+    """Benchmark of the rates that all runs have in common."""
     votes, verified, _ = measured(quick, seed)
     agree = [rate.agrees for tally in votes for rate in differences(tally)]
     figures = {
@@ -119,7 +119,7 @@ def run(quick: bool, seed: int) -> Report:
 
 
 def write(quick: bool, seed: int) -> Written:
-    """The section of the verification, and the page with every run by votes."""
+    """Section of the verification, and the page with every run by votes."""
     votes, verified, seeds = measured(quick, seed)
     with tempfile.TemporaryDirectory() as folder:
         plots = Path(folder) / "plots"
@@ -191,7 +191,7 @@ def _name(tally: Tally) -> str:
 
 
 def _draw(votes: Sequence[Tally], verified: Sequence[Tally], pictures: Folder) -> None:
-    """Of every run the share of stars not named rightly, by votes and verified."""
+    """Draw the share of stars of every run not named rightly, by votes and verified."""
     figure = pictures.figure(9.0, 3.6)
     axis = figure.subplots()
     for tallies, color, label, marker in (

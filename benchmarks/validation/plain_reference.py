@@ -1,4 +1,4 @@
-"""The service held against the plain implementation at full size: batches of every kind.
+"""Service against the plain implementation at full size, with batches of every kind.
 
 Priors, switches, tolerances, grids, noise, serious errors, spurious stars,
 missing magnitudes and several trackers are drawn at random; outcome, star,
@@ -25,11 +25,11 @@ from tests.reference.compare import Judge
 BATCHES, QUICK_BATCHES = 2000, 100
 BLOCK = 50
 LEAST_OF_EACH = 0.02
-"""Of the stars at least so many are unique, ambiguous and unmatched: all outcomes are compared."""
+"""Least share of unique, ambiguous and unmatched stars, so that all outcomes are compared."""
 
 
 def run(quick: bool, seed: int) -> Report:
-    """The benchmark: every shipped mission, and a tenth as many batches of three trackers."""
+    """Benchmark of all shipped missions, and a tenth as many batches of three trackers."""
     count = QUICK_BATCHES if quick else BATCHES
     sky = SkyModel(load_embedded(), LruCache(256 << 20))
     shipped = [
@@ -67,7 +67,7 @@ def run(quick: bool, seed: int) -> Report:
 
 
 def write(quick: bool, seed: int) -> Written:
-    """The section of the verification."""
+    """Section of the verification about the plain implementation."""
     report = run(quick, seed)
     text = f"""
 A second implementation of the votes stands in `tests/reference/plain_starid.py`. It was written

@@ -1,4 +1,4 @@
-"""PTP against its paper's numbers and against its own laws: Table 1, the search range, refusals."""
+"""Test of PTP against its paper and its own laws: Table 1, the search range, refusals."""
 
 import math
 from collections.abc import Iterator
@@ -30,11 +30,11 @@ AT_REST = np.zeros(3)
 LEAST_SHARED = 0.9
 MOST_EXCESS = 3.0
 ALLOWED = 1
-"""Fields that may be accepted: the check lets chance through once in 10,000 at most, on average."""
+"""Greatest number of accepted random fields: the check passes one in 10,000 on average."""
 
 
 def run(quick: bool, seed: int) -> Report:
-    """The benchmark."""
+    """Benchmark of PTP."""
     fields = QUICK_FIELDS if quick else FIELDS
     rng = np.random.default_rng(seed)
     sky = SceneSky.to_magnitude(6.0)
@@ -67,7 +67,7 @@ def run(quick: bool, seed: int) -> Report:
 
 
 def _axis(figures: dict[str, object], bounds: list[Bound]) -> None:
-    """Our principal axis beside that of the paper's Table 1."""
+    """Compare the principal axis with that of the paper's Table 1."""
     settings = RunCatalogSettings(magnitude_limit_mag=6.01, merge_within_arcsec=0.0)
     stars = build_run_catalog(load_embedded(), settings, 2000.0)
     index = build_triangles(stars.direction)
@@ -85,7 +85,7 @@ def _axis(figures: dict[str, object], bounds: list[Bound]) -> None:
 def _search_range(
     guide: Guide, rng: np.random.Generator, figures: dict[str, object], bounds: list[Bound]
 ) -> None:
-    """The k-vector's excess, and how many true projections three sigma_P cover."""
+    """Measure the k-vector's excess, and the share of projections within three sigma_P."""
     index, sigma = guide.triangles, Conditions().camera.pixel_rad
     excess, missed = [], 0
     value = index.projection.value
@@ -126,7 +126,7 @@ def _search_range(
 
 
 def _random(sky: SceneSky, px: float, fields: int, seed: int) -> Iterator[Scene]:
-    """Fields of 5 to 20 points."""
+    """Fields of 5 to 20 random points."""
     conditions = Conditions(position_px=px)
     rng = np.random.default_rng([seed, round(10 * px)])
     label = f"random, {px:g} px"
@@ -140,7 +140,7 @@ def _is_accepted(scene: Scene, guide: Guide) -> bool:
 
 
 def write(quick: bool, seed: int) -> Written:
-    """The section of the verification."""
+    """Section of the verification about PTP."""
     report, fields = run(quick, seed), QUICK_FIELDS if quick else FIELDS
     text = f"""
 The identifier `ptp` beside the paper it comes from (Zhou & Ye 2015). The nine rows of the paper's

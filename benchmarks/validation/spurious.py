@@ -1,4 +1,4 @@
-"""Spurious stars: planets, debris, hot pixels among the stars, by votes and verified.
+"""Spurious stars (planets, debris, hot pixels), with votes and verified identification.
 
 python -m benchmarks spurious
 """
@@ -19,12 +19,12 @@ from studies.documents import Folder
 
 SPURIOUS, QUICK_SPURIOUS = 20_000, 300
 VOTES_SHARE = 0.1
-"""The votes need no more than a tenth of the views to show what they are worth."""
+"""Share of the views for votes, which need no more."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """A row: where, how many of how many stars are spurious; what is asked of it, in percent.
+    """Case: world, numbers of stars and spurious stars, and limits in percent.
 
     `prior_off_deg` is that of a `Condition`.
     """
@@ -41,7 +41,7 @@ class Case:
 
     @property
     def condition(self) -> Condition:
-        """How its views are drawn."""
+        """Condition for drawing the views."""
         return Condition(
             (self.world,),
             stars=self.stars,
@@ -51,15 +51,15 @@ class Case:
 
     @property
     def label(self) -> str:
-        """The row in few words."""
+        """Label of the row in a few words."""
         wide = "" if self.prior_off_deg is None else f", prior 0 to {self.prior_off_deg:g}°"
         return f"{PLACES[self.world]}, {self.spurious} of {self.stars}{wide}"
 
 
 FEW_RIGHT = 5.0
-"""Where two real stars are left among thousands, at most so many percent can be named."""
+"""Greatest percentage that can be named with two real stars left among thousands."""
 WIDE_DEG = 2.0
-"""The rows that are not of the paper's attitude error: about as far as a slew may miss."""
+"""Greatest a priori error in degrees of rows without the paper's errors: that of a slew."""
 CASES = (
     *(Case(world, 1, 5, 99.5) for world in ("cap", "cap_forest", "band", "band_forest")),
     *(Case(world, 2, 5, 99.0) for world in ("cap", "cap_forest", "band", "band_forest")),
@@ -76,7 +76,7 @@ PLACES = {"cap": "cap", "cap_forest": "cap forest", "band": "band", "band_forest
 
 @dataclass(frozen=True)
 class Shares:
-    """Of the real stars right, wrong, and the likeliest name right; of the spurious those named."""
+    """Counts of real stars right, wrong, and right in the likeliest name; spurious stars named."""
 
     real: int
     spurious: int
@@ -87,22 +87,22 @@ class Shares:
 
     @property
     def right_pct(self) -> float:
-        """Real stars named rightly."""
+        """Percentage of real stars named rightly."""
         return 100.0 * self.right / self.real
 
     @property
     def wrong_pct(self) -> float:
-        """Real stars named wrongly."""
+        """Percentage of real stars named wrongly."""
         return 100.0 * self.wrong / self.real
 
     @property
     def first_pct(self) -> float:
-        """Real stars whose likeliest name is right."""
+        """Percentage of real stars whose likeliest name is right."""
         return 100.0 * self.first / self.real
 
     @property
     def named_pct(self) -> float:
-        """Spurious stars that are given a name."""
+        """Percentage of spurious stars with a name."""
         return 100.0 * self.named / self.spurious
 
 
@@ -113,7 +113,7 @@ def shares(
     identifier: Identifier = "verified",
     step: Callable[[int], object] = int,
 ) -> Shares:
-    """A case with at least so many spurious stars."""
+    """Counts of a case with at least a number of spurious stars."""
     total = np.zeros(6, np.int64)
     views = -(-spurious // case.spurious)
     for judged in judged_views(case.condition, views, seed, identifier):
@@ -133,7 +133,7 @@ def shares(
 
 
 def bounds_of(measured_cases: Sequence[tuple[Case, Shares, Shares]]) -> list[Bound]:
-    """The bounds of every case, and that the votes name no fewer spurious stars in any."""
+    """Bounds of every case; the votes must name at least as many spurious stars in each."""
     votes = [
         at_least(f"{case.label}: spurious named by votes", by_votes.named_pct, found.named_pct, "%")
         for case, found, by_votes in measured_cases
@@ -160,7 +160,7 @@ def _case_bounds(case: Case, found: Shares) -> list[Bound]:
 
 
 def measured(quick: bool, seed: int) -> list[tuple[Case, Shares, Shares]]:
-    """Every case, verified and by votes."""
+    """Counts of every case, verified and by votes."""
     spurious = QUICK_SPURIOUS if quick else SPURIOUS
     found = []
     with tqdm(total=len(CASES) * spurious, desc="spurious", unit="star", unit_scale=True) as bar:
@@ -172,7 +172,7 @@ def measured(quick: bool, seed: int) -> list[tuple[Case, Shares, Shares]]:
 
 
 def run(quick: bool, seed: int) -> Report:
-    """The benchmark: every case."""
+    """Benchmark of every case."""
     figures: dict[str, str] = {}
     cases = measured(quick, seed)
     for case, found, _ in cases:
@@ -184,7 +184,7 @@ def run(quick: bool, seed: int) -> Report:
 
 
 def write(quick: bool, seed: int) -> Written:
-    """The section of the verification."""
+    """Section of the verification about spurious stars."""
     found = measured(quick, seed)
     rows = [
         (
@@ -228,7 +228,7 @@ off, they do not: only the share of the row with 3 of 5 and 0 to {WIDE_DEG:g}° 
 
 
 def _draw(found: list[tuple[Case, Shares, Shares]], pictures: Folder) -> None:
-    """Bars of every case: the real stars right, and the spurious ones named."""
+    """Draw bars of every case: the real stars right, and the spurious ones named."""
     figure = pictures.figure(9.0, 4.2)
     axes = figure.subplots(1, 2, sharey=True)
     places = np.arange(len(found))[::-1]

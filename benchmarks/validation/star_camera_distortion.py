@@ -43,7 +43,7 @@ SOURCES = ("service/features/calibration", "service/vectors.py")
 MODULE = "benchmarks.validation.star_camera_distortion"
 
 ROUGH_ARCSEC_PER_PX = 4.97
-"""To start from; the fit finds the scale."""
+"""Approximate scale at the start; the fit finds the exact one."""
 SIGMA_ARCSEC, FOLDS, RUNS = 0.2, 10, 10
 MOST_ARCSEC = {"y angle": 0.20, "z angle": 0.21}
 STEPS = (
@@ -65,7 +65,7 @@ CAMERA = Tracker(
 
 @dataclass(frozen=True)
 class Step:
-    """A model with its held-out residuals (runs, n, 2) in arcsec and the fit to all rows."""
+    """Model with its held-out residuals (runs, n, 2) in arcsec, and the fit to all rows."""
 
     name: str
     unknowns: int
@@ -74,12 +74,12 @@ class Step:
 
     @property
     def rms_arcsec(self) -> Array:
-        """Held-out residuals of the y angle and of the z angle."""
+        """Rms of held-out residuals of the y angle and of the z angle."""
         return np.asarray(np.sqrt(np.mean(self.held_out_arcsec**2, axis=(0, 1))))
 
 
 def observed(folder: Path) -> IdentifiedStars:
-    """The rows of the file as stars with known attitudes, one batch each."""
+    """Rows of the file as stars with known attitudes, one batch each."""
     from astropy.io import fits
 
     with fits.open(folder / FILE) as file:
@@ -107,7 +107,7 @@ def observed(folder: Path) -> IdentifiedStars:
 def measured_step(
     stars: IdentifiedStars, name: str, degree: int, warm: bool, runs: int, seed: int
 ) -> Step:
-    """One model: every row predicted by a fit to the other folds, `runs` times anew."""
+    """Result of one model: every row predicted by a fit to the other folds, `runs` times."""
     reference_c = float(stars.temperature_c.mean()) if warm else None
     model = Model(degree=degree, reference_temperature_c=reference_c, attitudes_known=True)
     rng = np.random.default_rng(seed)
@@ -122,7 +122,7 @@ def measured_step(
 
 
 def _predicted(stars: IdentifiedStars, model: Model, fitted: Calibration) -> Array:
-    """Residuals (n, 2) in arcsec of stars that a fit has not seen."""
+    """Residuals (n, 2) in arcsec of stars that were not in the fit."""
     unknowns = unknowns_of(stars.trackers, model)
     values = {each.name: v for each, v in zip(fitted.unknowns, fitted.value, strict=True)}
     inside = np.array([values.get(each.name, 0.0) * each.per_unit for each in unknowns])
@@ -131,13 +131,13 @@ def _predicted(stars: IdentifiedStars, model: Model, fitted: Calibration) -> Arr
 
 
 def measured(folder: Path, runs: int, seed: int) -> list[Step]:
-    """Every model of `STEPS`."""
+    """Results of all models in `STEPS`."""
     stars = observed(folder)
     return [measured_step(stars, *step, runs, seed) for step in STEPS]
 
 
 def bounds_of(steps: list[Step]) -> list[Bound]:
-    """Of the cubic with temperature."""
+    """Bounds of the cubic model with temperature."""
     (best,) = (each for each in steps if each.name == STEPS[2][0])
     return [
         at_most(f"{best.name}: held-out rms of {angle}", float(rms), most, "arcsec")
@@ -146,7 +146,7 @@ def bounds_of(steps: list[Step]) -> list[Bound]:
 
 
 def text_of(steps: list[Step], count: int, seed: int) -> str:
-    """The part of the page."""
+    """Text of the measured part of the page."""
     rows = [
         (
             each.name,
@@ -175,7 +175,7 @@ Seed {seed}; again: `python -m {MODULE} --folder FOLDER --write`."""
 
 
 def paint(folder: Folder, steps: list[Step]) -> None:
-    """Residuals over the field: linear, cubic, and with temperature."""
+    """Draw the residuals over the field: linear, cubic, and with temperature."""
     shown = steps[:3]
     figure = folder.figure(9.0, 4.0)
     axes = figure.subplots(1, len(shown), sharey=True)
@@ -200,7 +200,7 @@ def paint(folder: Folder, steps: list[Step]) -> None:
 
 
 def write(text: str, steps: list[Step]) -> None:
-    """Put the measured part into the page and the picture beside it."""
+    """Write the measured part into the page, and the picture."""
     start, end = f"<!-- measured by {MODULE} -->", "<!-- end of star camera -->"
     before, _, rest = DOCUMENT.read_text(encoding="utf-8").partition(start)
     part = f"{start}\n\n{text}\n\n{end}"

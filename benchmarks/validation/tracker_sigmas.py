@@ -1,4 +1,4 @@
-"""Whether the sigmas of a calibration of trackers hold, over many simulated stretches.
+"""Test of the sigmas of a calibration of trackers over many simulated periods.
 
     python -m benchmarks tracker_sigmas
 
@@ -34,14 +34,14 @@ MISALIGNMENTS, QUICK_MISALIGNMENTS = 100, 10
 POOLED, QUICK_POOLED = 400, 20
 BATCHES_OF_MISALIGNMENT, BATCHES_OF_POOLED = 100, 60
 TOLD_SIGMA_ARCSEC = 4.0
-"""The stars have 6 arcsec."""
+"""Wrong sigma given to the calibration; the true one is 6 arcsec."""
 LEAST_WITHIN = 0.97
 SIZE = (0.93, 1.07)
 QUICK_SIZE = (0.85, 1.15)
 
 
 def misalignment_errors(seed: int) -> Array:
-    """Errors (3,) of the misalignment of one stretch, in sigmas."""
+    """Errors (3,) of the misalignment of one period, in sigmas."""
     rng = np.random.default_rng([1, seed])
     stars = drawn(rng, BATCHES_OF_MISALIGNMENT, Truth(MISALIGNED, bending(rng)))
     found = calibrate(stars, Model())
@@ -50,7 +50,7 @@ def misalignment_errors(seed: int) -> Array:
 
 
 def pooled_errors(seed: int) -> Array:
-    """Errors (p,) of every unknown of one stretch, in sigmas."""
+    """Errors (p,) of every unknown of one period, in sigmas."""
     rng = np.random.default_rng([2, seed])
     truth, stars, model = everything(rng, BATCHES_OF_POOLED, told_sigma_arcsec=TOLD_SIGMA_ARCSEC)
     found = calibrate(stars, model)
@@ -58,7 +58,7 @@ def pooled_errors(seed: int) -> Array:
 
 
 def run(quick: bool, seed: int) -> Report:
-    """Both, over as many seeds as are asked for, from `seed` on."""
+    """Benchmark of both tests over many seeds, from `seed` on."""
     begun_s = time.perf_counter()
     turns, every = (QUICK_MISALIGNMENTS, QUICK_POOLED) if quick else (MISALIGNMENTS, POOLED)
     of_turn = _over("misalignment", misalignment_errors, turns, seed)

@@ -1,4 +1,4 @@
-"""Two groups of stars, mirrored fields, no star at all: what is called good must be right.
+"""Two groups of stars, mirrored fields, and random points: good attitudes must be right.
 
     python -m benchmarks two_groups            ghosts, slews, mirrored axes, random points
     python -m benchmarks two_groups --quick    small samples
@@ -31,7 +31,7 @@ from tests.reference.two_groups import Counted, Simple, simple, two_groups
 MISSIONS = ("XTE", "SWAS", "SOHO")
 KINDS, STARS = ("ghosts", "slews"), (6, 10)
 BATCHES, QUICK_BATCHES = 5000, 40
-"""Of every mission, kind, number of stars, with and without an a priori attitude."""
+"""Batches per mission, kind and number of stars, with and without an a priori attitude."""
 MIRRORED, POINTS, TWO_POINTS, NOMINAL, QUICK = 20_000, 20_000, 50_000, 50_000, 100
 POINT_COUNTS = (3, 4, 5, 6, 7, 8)
 MOST_WRONG_PCT, LEAST_NAMED_RIGHT_PCT, LEAST_RIVAL_PCT = 0.1, 99.9, 99.0
@@ -41,7 +41,7 @@ SHELF_BYTES = 256 << 20
 
 @dataclass(frozen=True)
 class Row:
-    """One row of the first table: where and how it was drawn, and what came of it."""
+    """Row of the first table: mission, kind and stars of its batches, and their results."""
 
     mission: str
     kind: str
@@ -50,7 +50,7 @@ class Row:
     counted: Counted
 
     def bounds(self) -> tuple[Bound, Bound]:
-        """Wrong answers, and rivals not named; one batch is allowed for in small samples."""
+        """Bounds of wrong answers and of unnamed rivals; small samples may have one batch more."""
         prior = "a priori" if self.with_prior else "no prior"
         name = f"{self.mission}, {self.kind}, {self.stars} stars, {prior}"
         counted = self.counted
@@ -65,7 +65,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Task:
-    """What one process is given: a row of ghosts or slews, or batches of one group each."""
+    """Work of one process: a row of ghosts or slews, or batches of one group each."""
 
     seed: int
     mission: str
@@ -75,7 +75,7 @@ class Task:
     batches: int
 
     def run(self) -> Counted | Simple:
-        """Draw and acquire its batches."""
+        """Draw and process the batches."""
         sky = SkyModel(load_embedded(), LruCache(SHELF_BYTES))
         drawn = [self.seed, *self.mission.encode(), *self.kind.encode(), self.stars]
         rng = np.random.default_rng([*drawn, self.with_prior])
@@ -94,7 +94,7 @@ class Task:
 
 
 def measured(quick: bool, seed: int) -> tuple[list[Row], dict[str, Simple]]:
-    """Every row, and by label what came of single groups."""
+    """All rows, and the results of single groups by label."""
     batches = QUICK_BATCHES if quick else BATCHES
     rows = [
         Task(seed, mission, kind, stars, with_prior, batches)
@@ -131,7 +131,7 @@ def measured(quick: bool, seed: int) -> tuple[list[Row], dict[str, Simple]]:
 
 
 def bounds_of(rows: list[Row], others: dict[str, Simple]) -> list[Bound]:
-    """All that is asked."""
+    """Bounds of rows and single groups."""
     by_row = [row.bounds() for row in rows]
     bounds = [wrong for wrong, _ in by_row]
     about = "good attitudes of the other group alone, named as rivals in 99 %"
@@ -154,7 +154,7 @@ def bounds_of(rows: list[Row], others: dict[str, Simple]) -> list[Bound]:
 
 
 def run(quick: bool, seed: int) -> Report:
-    """The benchmark: every row."""
+    """Benchmark of all rows."""
     rows, others = measured(quick, seed)
     figures = {
         f"{row.mission}, {row.kind}, {row.stars}, {'a priori' if row.with_prior else 'no prior'}": (
@@ -172,13 +172,13 @@ def run(quick: bool, seed: int) -> Report:
 
 
 def _each(rows: list[Row], name: str) -> str:
-    """A value of every mission, in the order of `MISSIONS`."""
+    """Text of a value of every mission, in the order of `MISSIONS`."""
     values = [getattr(row.counted, name) for row in rows]
     return " / ".join(f"{value:.2f}" if name.endswith("pct") else f"{value:,}" for value in values)
 
 
 def write(quick: bool, seed: int) -> Written:
-    """The section of the verification."""
+    """Section of the verification about two groups of stars."""
     rows, others = measured(quick, seed)
     kinds = dict.fromkeys((row.kind, row.stars, row.with_prior) for row in rows)
     alike = [[r for r in rows if (r.kind, r.stars, r.with_prior) == kind] for kind in kinds]

@@ -1,7 +1,7 @@
 """Views with known truth for the benchmarks of verified identification.
 
-They are the views of the paper's simulator, spoilt as a condition says, and go
-through the whole pipeline.
+The views come from the paper's simulator, with the errors of a condition, and go through the whole
+pipeline.
 """
 
 from collections.abc import Iterator
@@ -30,7 +30,7 @@ Rows = npt.NDArray[np.intp]
 
 SHELF_BYTES = 128 << 20
 VIEWS_PER_BAND = 50
-"""Of one band, whose pairs take longer to list than many views to identify; a cap has ten.
+"""Views per band, whose pairs take longer to list than many views to identify; a cap has ten.
 
 Fifty fields anywhere along a band hardly share a star.
 """
@@ -49,19 +49,18 @@ PRIOR_ERRORS = {
     ("serious", "XTE"): '100°, 40", 60"',
     ("serious", "SOHO"): "3°, 3°, 3°",
 }
-"""The rotations of `ERRORS` as a table names them."""
+"""Texts of the rotations of `ERRORS` for a table."""
 
 
 @dataclass(frozen=True)
 class Condition:
-    """How views are drawn and spoilt: in which worlds of the paper, with which errors.
+    """Condition of views: worlds of the paper, numbers of stars, and errors.
 
-    A view has `stars` stars, or any number from `stars` to `most_stars`;
-    `spurious` of them stand anywhere in the field.  With `prior_off_deg` the a
-    priori attitude is off about any axis by an angle drawn evenly up to so many
-    degrees, instead of by the fixed angles of `errors`.  The share `missing` of the
-    run catalog is withheld from the identifier.  Unless `merged`, the catalog
-    and the sky have every component of a double by itself.
+    A view has `stars` stars, or any number from `stars` to `most_stars`; `spurious` of them are
+    anywhere in the field.  With `prior_off_deg` the a priori attitude is off about a random axis by
+    an angle drawn evenly up to `prior_off_deg`, instead of by the fixed angles of `errors`.  The
+    share `missing` of the run catalog is withheld from the identifier.  Unless `merged`, the
+    catalog and the sky have every component of a double separately.
     """
 
     worlds: tuple[str, ...]
@@ -76,7 +75,7 @@ class Condition:
 
     @property
     def prior_error(self) -> str:
-        """How far the a priori attitude is off, as a table names it."""
+        """Text of the error of the a priori attitude for a table."""
         if self.prior_off_deg is not None:
             return f"0 to {self.prior_off_deg:g}° about any axis"
         missions = dict.fromkeys(the_paper().worlds[world].mission for world in self.worlds)
@@ -85,15 +84,15 @@ class Condition:
 
 @dataclass(frozen=True)
 class Judged:
-    """One view: what was said of its stars, and the row of each in the run catalog, -1 for none."""
+    """View with the results for its stars, and each star's true run catalog row, or -1."""
 
     found: Identification
     truth: Rows
 
     def first(self) -> tuple[Rows, Vector]:
-        """Of every star the likeliest row, named or the first of its rivals, and its probability.
+        """Likeliest row of every star, named or first rival, and its probability.
 
-        -1 and 0 where there is none.
+        -1 and 0 without one.
         """
         star = self.found.star.copy()
         probability = np.where(self.found.unique, self.found.probability, 0.0)
@@ -105,19 +104,19 @@ class Judged:
 
 @dataclass(frozen=True)
 class ThinnedSky(SkyModel):
-    """A sky whose run catalogs have lost some stars, the same ones for every batch."""
+    """Sky whose run catalogs lack some stars, the same ones for every batch."""
 
     kept: float
     seed: int
 
     def run_catalog(self, mission: Mission, time: Utc) -> RunCatalog:
-        """The run catalog less those stars."""
+        """Run catalog without the missing stars."""
         return thinned(super().run_catalog(mission, time), self.kept, self.seed)
 
 
 @lru_cache(maxsize=8)
 def thinned(catalog: RunCatalog, kept: float, seed: int) -> RunCatalog:
-    """A run catalog with a random share of its stars."""
+    """Run catalog with a random share of its stars."""
     rows = kept_rows(catalog, kept, seed)
     return replace(
         catalog,
@@ -138,7 +137,7 @@ def kept_rows(catalog: RunCatalog, kept: float, seed: int) -> Rows:
 def judged_views(
     condition: Condition, views: int, seed: int, identifier: Identifier = "verified"
 ) -> Iterator[Judged]:
-    """So many views of a condition, in its worlds by turns, identified."""
+    """Identified views of a condition, in its worlds by turns."""
     catalog, cache = load_embedded(), LruCache(SHELF_BYTES)
     whole = SkyModel(catalog, cache)
     kept = 1.0 - condition.missing
@@ -208,7 +207,7 @@ def _cut(view: View, stars: int) -> View:
 
 
 def _spoilt(view: View, condition: Condition, mission: Mission, rng: np.random.Generator) -> View:
-    """The view with spurious stars anywhere in its field and its magnitudes off."""
+    """View with spurious stars anywhere in its field, and wrong magnitudes."""
     star, direction = view.star.copy(), view.direction.copy()
     tracker = mission.trackers[0]
     boresight = view.attitude.T @ tracker.body_from_tracker[:, 2]
@@ -220,7 +219,7 @@ def _spoilt(view: View, condition: Condition, mission: Mission, rng: np.random.G
 
 
 def interval(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
-    """The share's confidence interval by Clopper and Pearson."""
+    """Clopper-Pearson confidence interval of a share."""
     tail = (1.0 - confidence) / 2.0
     low = float(beta.ppf(tail, successes, trials - successes + 1)) if successes else 0.0
     high = float(beta.ppf(1.0 - tail, successes + 1, trials - successes))

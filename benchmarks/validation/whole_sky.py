@@ -1,4 +1,4 @@
-"""Verified identification with nothing known beforehand: the zone is the whole sky.
+"""Verified identification without prior knowledge: the zone is the whole sky.
 
 python -m benchmarks whole_sky
 """
@@ -31,7 +31,7 @@ LEAST_RIGHT, MOST_WRONG_VIEWS = 0.999, 1e-4
 
 @dataclass(frozen=True)
 class Found:
-    """Stars and views of them, and what became of them."""
+    """Numbers of stars and views, and of their results."""
 
     views: int
     stars: int
@@ -41,7 +41,7 @@ class Found:
 
 
 def whole_sky_mission() -> Mission:
-    """SOHO's tracker and run catalog, a cap of 180 degrees, pairs as wide as the field of view."""
+    """Mission with SOHO's tracker and run catalog, and a cap of 180 degrees."""
     settings = paper_mission("SOHO").model_dump()
     settings["name"] = "WHOLE-SKY"
     settings["zone"] = {"kind": "cap", "axis_body": [0.0, 0.0, 1.0], "radius_deg": 180.0}
@@ -50,7 +50,7 @@ def whole_sky_mission() -> Mission:
 
 
 def measured(views: int, seed: int, step: Callable[[int], object] = int) -> Found:
-    """Views of any attitude, the a priori one always the same and meaning nothing."""
+    """Results of views of random attitudes, with a constant, meaningless a priori attitude."""
     sky, mission = SkyModel(load_embedded(), LruCache(512 << 20)), whole_sky_mission()
     catalog = sky.run_catalog(mission, EPOCH)
     world = replace(the_paper().worlds["cap"], views=1)
@@ -97,13 +97,13 @@ def _figures(found: Found) -> dict[str, object]:
 
 
 def run(quick: bool, seed: int) -> Report:
-    """The benchmark: shares right and wrong."""
+    """Benchmark of the whole sky: shares right and wrong."""
     found, bounds = _measured(quick, seed)
     return Report("whole_sky", _figures(found), bounds)
 
 
 def write(quick: bool, seed: int) -> Written:
-    """The section of the verification."""
+    """Section of the verification about the whole sky."""
     found, bounds = _measured(quick, seed)
     text = f"""
 The same identifier where nothing is known of the attitude: the zone is a cap of 180°, which a

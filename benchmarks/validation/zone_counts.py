@@ -1,4 +1,4 @@
-"""Stars and pairs of the paper's own zones, from the shipped catalog, beside the paper's."""
+"""Numbers of stars and pairs in the paper's zones, from the shipped catalog and the paper."""
 
 from benchmarks.bounds import Bound, at_most
 from benchmarks.record import CORE
@@ -11,7 +11,7 @@ from tests.reference.zone_counts import ZoneQuantity, counts
 
 
 def run(quick: bool, seed: int) -> Report:
-    """The benchmark's form of it; neither the size nor the seed matters."""
+    """Benchmark of zone counts; neither the size nor the seed matters."""
     found = list(counts(SkyModel(load_embedded(), LruCache(256 << 20))))
     figures = {
         f"{c.zone}, {c.quantity}": f"{c.ours:,} (paper {c.paper:,}, {c.off:+.1%})" for c in found
@@ -20,7 +20,7 @@ def run(quick: bool, seed: int) -> Report:
 
 
 def bounds_of(found: list[ZoneQuantity]) -> list[Bound]:
-    """The largest difference of each quantity, stars and pairs."""
+    """Bounds of the greatest differences of stars and of pairs."""
     return [
         at_most(
             f"largest difference of {quantity}, as a share",
@@ -32,7 +32,7 @@ def bounds_of(found: list[ZoneQuantity]) -> list[Bound]:
 
 
 def write(quick: bool, seed: int) -> Written:
-    """The section of the verification; neither the size nor the seed matters."""
+    """Section of the verification about zone counts; neither size nor seed matters."""
     found = list(counts(SkyModel(load_embedded(), LruCache(256 << 20))))
     rows = [
         (zone, *(cell for c in found if c.zone == zone for cell in _cells(c)))

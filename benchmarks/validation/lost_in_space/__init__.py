@@ -1,1 +1,1 @@
-"""Lost in space: the service's own solver in every condition, and beside others."""
+"""Lost in space: the service's own solver in all conditions, compared with others."""

@@ -34,7 +34,7 @@ TARGET = ROOT / "docs" / "lost-in-space.md"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command; the exit code is 1 where a figure is out of bounds."""
+    """Command that measures and writes; returns 1 if a figure is out of bounds."""
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.validation.lost_in_space",
         description=__doc__,

@@ -1,4 +1,4 @@
-"""The conditions: how scenes are drawn, what solvers are told of them, who takes part."""
+"""Conditions: errors of scenes, inputs of solvers, and participating solvers."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -51,14 +51,14 @@ UNCALIBRATED_MAG = {
     "magnitudes off 5": 5.0,
     "magnitudes without zero point": -17.5,
 }
-"""Offsets.  The last is -2.5 log10 of counts, 10^5 of which a star of V 5 gives."""
+"""Magnitude offsets; the last is -2.5 log10 of counts, of which a star of V 5 has 10^5."""
 MOMENT = "2000-01-01T12:00:00Z"
 WIDEST_PRIOR_DEG = 3.0
 
 
 @dataclass(frozen=True)
 class Condition:
-    """One way to draw scenes.  `share` of the scenes asked for; `real`: there is a right answer."""
+    """Condition for drawing scenes.  `share` of the requested scenes; `real`: an answer exists."""
 
     conditions: Conditions = field(default_factory=Conditions)
     share: float = 0.125
@@ -69,10 +69,10 @@ class Condition:
     offset_mag: float = 0.0
     prior_deg: float | None = None
     alone: bool = False
-    """Not for the peers: they know neither sigmas nor magnitudes."""
+    """True without peers: they use neither sigmas nor magnitudes."""
 
     def draw(self, count: int, seed: int, first: int) -> list[tuple[Scene, int]]:
-        """Scenes of a seed, each with how many of its stars the database holds."""
+        """Scenes of a seed, each with the number of its stars in the database."""
         sky = _sky()
         if self.random_points:
             drawn = [
@@ -138,7 +138,7 @@ def _database() -> SceneSky:
 
 
 def solvers_of(condition: Condition, with_peers: bool) -> list[Solver]:
-    """Who takes part, the service's own first."""
+    """Participating solvers, the service's own first."""
     camera, run_catalog = condition.conditions.camera, _database().run_catalog
     if condition.prior_deg is not None:
         return _with_prior(condition, condition.prior_deg, with_peers)
@@ -152,14 +152,14 @@ def solvers_of(condition: Condition, with_peers: bool) -> list[Solver]:
 
 
 def _off_by(scene: Scene, deg: float) -> Matrix:
-    """The scene's attitude turned by so much about an axis that the scene itself draws."""
+    """Attitude of a scene rotated by an angle about an axis that the scene determines."""
     rng = np.random.default_rng(np.frombuffer(scene.attitude.tobytes(), np.uint32))
     turn = rotate_about(random_axis(rng) * math.radians(deg), np.eye(3)).T
     return np.asarray(turn @ scene.attitude)
 
 
 def _with_prior(condition: Condition, deg: float, with_peers: bool) -> list[Solver]:
-    """The whole pipeline with its a priori attitude, and tetra3rs told the same."""
+    """Solvers with an a priori attitude: the whole pipeline, and tetra3rs."""
     import importlib.util
 
     solvers = [_pipeline(condition.conditions, deg)]
@@ -173,7 +173,7 @@ def _with_prior(condition: Condition, deg: float, with_peers: bool) -> list[Solv
 
 
 def mission_of(conditions: Conditions) -> Mission:
-    """A mission whose one tracker is the camera; its cap is as wide as those of the paper."""
+    """Mission whose only tracker is the camera; its cap is as wide as those of the paper."""
     sigma_arcsec = conditions.position_px * conditions.camera.pixel_rad * ARCSEC_PER_RADIAN
     return Mission.model_validate(
         {

@@ -1,4 +1,4 @@
-"""The page about lost in space: bounds, tables, plots."""
+"""Page about lost in space: bounds, tables, plots."""
 
 import io
 import math
@@ -39,27 +39,27 @@ LEAST_RIGHT = {
     **dict.fromkeys(UNCALIBRATED_MAG, 0.98),
 }
 LEAST_RIGHT_OF_SIX, LEAST_OF_SIX = {"1 px": 0.999}, 0.998
-"""Of the fields with six stars or more; the second where a condition has none of its own."""
+"""Least share of right answers for fields of six or more stars: by condition, and default."""
 MOST_WRONG = {"1 px": 1 / 40_000, "2 px": 2 / 20_000, "random points": 1e-4, "mirrored": 0.0}
-"""Shares; one wrong more is allowed for in any sample that is smaller than one in the share."""
+"""Greatest shares of wrong answers; a sample smaller than one per share may have one more."""
 FEWER = {(name, WITHOUT_MAGNITUDES) for name in UNCALIBRATED_MAG}
-"""Conditions with as many right at least as another has."""
+"""Conditions that need at least as many right answers as another one."""
 SIGNIFICANT = 0.05
 NOT_ON_THE_PAGE = (
     *("0 px", "0.5 px", "five, prior 0.05 deg", "five, prior 1 deg"),
     *("ten and 0 spurious", "ten and 2 spurious", "sigma told half"),
 )
-"""Conditions between others, which the command prints; the plots have some of them."""
+"""Conditions that the command prints and the page omits; the plots have some of them."""
 OF_THE_SECTION = (
     *("1 px", "2 px", "random points", "mirrored"),
     *(WITHOUT_MAGNITUDES, *UNCALIBRATED_MAG),
 )
-"""The conditions of which the section of the verification shows the rates."""
+"""Conditions with rates in the section of the verification."""
 PLOTTED = ("0 px", "0.5 px", "1 px", "2 px")
 
 
 def bounds_of(rows: Sequence[Row]) -> list[Bound]:
-    """The bounds of the service's own rows; out of them is what is so beyond 95 % of luck."""
+    """Bounds of the service's rows; a figure is out of bounds beyond 95 % of chance."""
     bounds = []
     for row in rows:
         if row.solver not in OURS:
@@ -86,13 +86,13 @@ def bounds_of(rows: Sequence[Row]) -> list[Bound]:
 
 
 def _share_at_least(what: str, hits: int, of: int, least: float) -> Bound:
-    """The upper end of the share's 95 % interval is not below the bound."""
+    """Bound of a share: the upper end of its 95 % interval must reach the least share."""
     measured = f"{hits / of:.2%} of {of:,}" if of else "none"
     return Bound(what, measured, f"at least {least:.1%}", of > 0 and interval(hits, of)[1] >= least)
 
 
 def shown_rows(rows: Iterable[Row]) -> str:
-    """The rows as a table for the terminal and for the page."""
+    """Table of the rows for the terminal and the page."""
     head = (
         "| condition | solver | scenes | right % (95 %) | six stars or more % | wrong | none "
         "| median ms | p99 ms | longest ms | MB |"
@@ -112,7 +112,7 @@ def shown_rows(rows: Iterable[Row]) -> str:
 
 
 def section_text(rows: Sequence[Row]) -> str:
-    """What the page of verifications says of it: the service's own, without the clock."""
+    """Text for the page of verifications: the service's own rates, without times."""
     lines = [
         "Scenes of a camera of 10 degrees and 1,024 pixels at attitudes spread evenly, stars to",
         "V 6 after half a magnitude of noise, so that stars are lost and added; the index goes to",
@@ -137,7 +137,7 @@ def section_text(rows: Sequence[Row]) -> str:
 
 
 def document(rows: Sequence[Row], scenes: int, seed: int, turn: int) -> tuple[str, dict[str, str]]:
-    """The page and its plots by file name."""
+    """Page, and its plots by file name."""
     pictures = {
         "lost-in-space-rates.svg": _plot(rows, "rates"),
         "lost-in-space-times.svg": _plot(rows, "times"),

@@ -1,4 +1,4 @@
-"""The rows of lost in space: every solver on the same scenes, in turns, every answer checked."""
+"""Rows of lost in space: all solvers with the same scenes in rotation, all answers checked."""
 
 from collections.abc import Sequence
 
@@ -16,16 +16,16 @@ from benchmarks.validation.lost_in_space.document import SOURCES, bounds_of, sec
 from benchmarks.validation.lost_in_space.rows import Count, Row, row_of
 
 SLOW_SCENES = 100
-"""For solvers that take milliseconds."""
+"""Number of scenes for solvers that take milliseconds."""
 TURN = 200
-"""Scenes that one solver gets before the next has its turn."""
+"""Number of scenes for one solver before the next one continues."""
 OWN_SCENES, OWN_QUICK_SCENES = 8000, 400
 
 
 def measured(
     names: Sequence[str], scenes: int, seed: int, with_peers: bool = True, quiet: bool = False
 ) -> list[Row]:
-    """The rows of some conditions, solver by solver."""
+    """Rows of several conditions, by solver."""
     rows: list[Row] = []
     for name in names:
         condition = CONDITIONS[name]
@@ -51,7 +51,7 @@ def _one(
 
 
 def run(quick: bool, seed: int) -> Report:
-    """The service's own solver in every condition, held to its bounds; no peers, no clock."""
+    """Benchmark of the service's own solver in all conditions, without peers and times."""
     scenes = OWN_QUICK_SCENES if quick else OWN_SCENES
     rows = measured(list(CONDITIONS), scenes, seed, with_peers=False)
     bounds = bounds_of(rows)

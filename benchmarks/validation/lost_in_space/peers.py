@@ -1,9 +1,9 @@
-"""Solvers for points of which nothing is known, each driven the way its own documents say.
+"""Solvers for points of unknown identity, each used as its documentation says.
 
-All are given the same stars: the run catalog that our own index is made of.
-What a solver takes (pixels, vectors) is made ready before the clock starts, and
-what it gives is turned into an attitude after it stopped.  The peers come with
-the extra `peers`; one that is not installed is left out and said so.
+All have the same stars: the run catalog from which the service's index is made.  The input of a
+solver (pixels, vectors) is made before the clock starts, and its output is converted to an attitude
+after the clock stops.  The peers come with the extra `peers`; a missing one is left out with a
+message.
 """
 
 import importlib.util
@@ -27,13 +27,13 @@ from service.vectors import Matrix, from_ra_dec
 
 LIMIT_MAG = 6.5
 PATTERN_ERROR = 0.005
-"""Of tetra3's edge ratios: a pixel or two of noise in 1,024; its default of 0.001 finds 60 %."""
+"""Error of tetra3's edge ratios: noise of 1 to 2 px in 1,024; with its 0.001 it finds 60 %."""
 CACHE = Path(tempfile.gettempdir()) / "lost-in-space-peers"
 
 
 @dataclass(frozen=True)
 class Solver:
-    """A solver with its database: `ready` makes its input, `solve` is timed, `attitude` reads."""
+    """Solver with its database: `ready` makes its input, `solve` is timed, `attitude` reads."""
 
     name: str
     database_mb: float
@@ -41,13 +41,13 @@ class Solver:
     solve: Callable[[Any], Any]
     attitude: Callable[[Any], Matrix | None]
     slow: bool = False
-    """Given the first scenes only."""
+    """True for a solver that gets the first scenes only."""
 
 
 def ours(
     run_catalog: RunCatalog, field: FieldOfView, sigma: float = 1.0, offset_mag: float = 0.0
 ) -> Solver:
-    """The service's own, told sigmas and magnitudes that may be off."""
+    """The service's own solver, with sigmas and magnitudes that may be wrong."""
     index = build_sky_index(run_catalog, LIMIT_MAG, field.radius_deg)
     solver = LostInSpace(index, field)
     return Solver(
@@ -64,7 +64,7 @@ def ours(
 
 
 def peers(run_catalog: RunCatalog, camera: PinholeCamera, position_px: float) -> list[Solver]:
-    """Those that are installed."""
+    """Installed solvers of other projects."""
     made = []
     if importlib.util.find_spec("tetra3rs"):
         made.append(tetra3rs_solver(run_catalog, camera))
@@ -86,7 +86,7 @@ def tetra3rs_solver(
     hint: Callable[[Scene], Matrix] | None = None,
     hint_deg: float = 1.0,
 ) -> Solver:
-    """tetra3rs, its catalog file written from ours; with `hint` in its tracking mode."""
+    """Solver tetra3rs with a catalog file of our stars; with `hint`, in its tracking mode."""
     import tetra3rs
 
     path = _cached("tetra3rs", run_catalog, ".bin")

@@ -1,4 +1,4 @@
-"""What is counted of a solver in one condition, and the row that it makes."""
+"""Counts of a solver in one condition, and the resulting row."""
 
 import math
 import time
@@ -17,10 +17,10 @@ SIX = 6
 
 @dataclass(frozen=True)
 class Row:
-    """One solver in one condition; times in milliseconds a scene, the database in megabytes.
+    """Row of one solver in one condition; milliseconds per scene, megabytes of the database.
 
-    `six` counts the scenes with six or more detected stars that the database
-    holds, `right_of_six` those of them that were right.
+    `six` counts the scenes with at least six detected stars in the database; `right_of_six` counts
+    the right answers to these.
     """
 
     condition: str
@@ -39,7 +39,7 @@ class Row:
 
 @dataclass
 class Count:
-    """The tally of one solver."""
+    """Counts of one solver."""
 
     right: int = 0
     wrong: int = 0
@@ -49,7 +49,7 @@ class Count:
     ns: list[int] = field(default_factory=list)
 
     def take(self, solver: Solver, scenes: Sequence[tuple[Scene, int]], real: bool) -> None:
-        """Solve some scenes one after the other, each with its number of stars in the database."""
+        """Solve several scenes in order, each with its number of stars in the database."""
         if not scenes:
             return
         told = [solver.ready(scene) for scene, _ in scenes]
@@ -75,13 +75,13 @@ class Count:
 
 
 def right(scene: Scene, attitude: Matrix) -> bool:
-    """Whether an attitude is that of the scene."""
+    """True if an attitude agrees with that of the scene."""
     boresight_deg, rotation_deg = scene.off_from(attitude)
     return boresight_deg < RIGHT_BORESIGHT_DEG and rotation_deg < RIGHT_ROTATION_DEG
 
 
 def row_of(condition: str, solver: Solver, count: Count) -> Row:
-    """The row of a tally."""
+    """Row from the counts of a solver."""
     ms = np.array(count.ns or [0]) / 1e6
     return Row(
         condition,
@@ -111,7 +111,7 @@ def interval(hits: int, of: int) -> tuple[float, float]:
 
 
 def more_often(one: Row, other: Row) -> float:
-    """The chance that `one` is wrong so often only by luck, by Fisher's exact test, one-sided."""
+    """Probability that `one` is wrong so often by chance: Fisher's exact test, one-sided."""
     from scipy.stats import fisher_exact
 
     table = [[one.wrong, one.scenes - one.wrong], [other.wrong, other.scenes - other.wrong]]

@@ -36,18 +36,18 @@ MIRRORED = "answers to mirrored pictures that do not call them mirrored"
 OFF: tuple[float | None, ...] = (None, 0.0, 0.01, -0.01, 0.02, -0.02, 0.05, -0.05, 0.1, -0.1)
 WIDTH_PX, HEIGHT_PX = 1600, 1200
 COUNTS = (8, 12, 17, 25, 35, 60, 120, 250)
-"""Of points that no sky explains."""
+"""Numbers of points in patterns without a right answer."""
 
 Places = tuple[Vector, Vector]
 
 
 def run(quick: bool, seed: int) -> Report:
-    """The benchmark among the others."""
+    """Benchmark of wrong focal lengths."""
     return measured(8 if quick else PICTURES, seed, None)
 
 
 def measured(count: int, seed: int, folder: Path | None) -> Report:
-    """Solve so many drawn pictures, the real ones of a folder, and what has no answer."""
+    """Solve drawn pictures, the real ones of a folder, and patterns without an answer."""
     sky, solver = blind_sky(load_embedded(), YEAR)
     outcomes: Counter[tuple[float | None, str]] = Counter()
     lost = lost_told = mirrored = 0
@@ -110,12 +110,12 @@ def _range(rng: np.random.Generator) -> FocalRange:
 
 
 def points_anywhere(rng: np.random.Generator, count: int) -> Places:
-    """Places (n,), (n,) that are all as likely."""
+    """Uniformly distributed positions (n,), (n,)."""
     return rng.uniform(0.0, WIDTH_PX, count), rng.uniform(0.0, HEIGHT_PX, count)
 
 
 def clusters(rng: np.random.Generator, count: int) -> Places:
-    """One to five heaps, with a fifth of the points elsewhere."""
+    """Positions in one to five clusters, with a fifth of the points elsewhere."""
     u_px, v_px = points_anywhere(rng, count)
     heaps = int(rng.integers(1, 6))
     of = rng.integers(0, heaps, count)
@@ -128,7 +128,7 @@ def clusters(rng: np.random.Generator, count: int) -> Places:
 
 
 def streaks(rng: np.random.Generator, count: int) -> Places:
-    """Along a line of some width."""
+    """Positions along a line with some width."""
     angle = rng.uniform(0.0, math.pi)
     along, across = rng.uniform(-700.0, 700.0, count), rng.normal(0.0, rng.uniform(1, 60), count)
     return (
@@ -138,7 +138,7 @@ def streaks(rng: np.random.Generator, count: int) -> Places:
 
 
 def horizons(rng: np.random.Generator, count: int) -> Places:
-    """Lights that thin out below a line, with a fifth of the points elsewhere."""
+    """Positions of lights that thin out below a line, with a fifth of the points elsewhere."""
     u_px, v_px = points_anywhere(rng, count)
     low = rng.random(count) < 0.8
     v_px[low] = (rng.uniform(200.0, 1000.0) + rng.exponential(60.0, count))[low]
@@ -146,7 +146,7 @@ def horizons(rng: np.random.Generator, count: int) -> Places:
 
 
 def grids(rng: np.random.Generator, count: int) -> Places:
-    """Squares turned by an angle, each place off by half a pixel."""
+    """Positions on a rotated square grid, each off by half a pixel."""
     side = math.ceil(math.sqrt(count))
     step_px, angle = rng.uniform(20.0, 250.0), rng.uniform(0.0, 1.0)
     i, j = np.indices((side, side)).reshape(2, -1)[:, :count] - side / 2
@@ -156,7 +156,7 @@ def grids(rng: np.random.Generator, count: int) -> Places:
 
 
 def double_points(rng: np.random.Generator, count: int) -> Places:
-    """Each point twice, apart by the same: a picture of a camera that shook."""
+    """Pairs of positions at a fixed offset, as from a camera that shook."""
     u_px, v_px = points_anywhere(rng, count // 2)
     apart_px, angle = rng.uniform(3.0, 15.0), rng.uniform(0.0, 2.0 * math.pi)
     return (

@@ -1,9 +1,9 @@
-"""Solvers of pictures of unknown cameras, each with its own detector, driven as its documents say.
+"""Solvers for pictures of unknown cameras, each with its own detector, as documented.
 
 The peers are no part of the project: `PYTHONPATH` names a folder with `tetra3` (cedar-solve) and
-`tetra3rs`, and one that is not there is left out and said so.  Each has one database for fields
-of 5 to 50 degrees: cedar-solve's is made of our stars, tetra3rs has its own catalog.  The first
-use makes them, in minutes.
+`tetra3rs`; a missing one is left out with a message.  Each has one database for fields of 5 to 50
+degrees: cedar-solve's is made of the service's stars, tetra3rs has its own catalog.  The first use
+makes them, in minutes.
 """
 
 import importlib.util
@@ -29,12 +29,12 @@ from service.vectors import Matrix, from_ra_dec, ra_dec_of
 YEAR = 2020
 LEAST_FIELD_DEG, MOST_FIELD_DEG = 5.0, 50.0
 FIELD_ERROR = 0.15
-"""How far off, as a share, a solver takes a field that it is told for."""
+"""Relative error that a solver assumes of a given field of view."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """An attitude (3, 3) of the picture's middle; `covariance_rad2` where the solver tells it."""
+    """Attitude (3, 3) of the picture's middle; `covariance_rad2` if the solver gives one."""
 
     attitude: Matrix
     covariance_rad2: Matrix | None = None
@@ -42,14 +42,14 @@ class Answer:
 
 @dataclass(frozen=True)
 class PictureSolver:
-    """`solve` takes the counts and the field along the width in degrees, or None: it is timed."""
+    """Solver; `solve` takes the counts and the field along the width in degrees, or None."""
 
     name: str
     solve: Callable[[Any, float | None], Answer | None]
 
 
 def solvers() -> list[PictureSolver]:
-    """Ours, and the peers that are there."""
+    """The service's own solver, and the available peers."""
     made = [_ours()]
     if importlib.util.find_spec("tetra3"):
         made.append(_cedar_solve())
@@ -71,7 +71,7 @@ def _ours() -> PictureSolver:
 
 
 def focal_px(width_px: int, field_deg: float) -> float:
-    """The focal length with which a width spans a field."""
+    """Focal length with which a width spans a field of view."""
     return 0.5 * width_px / math.tan(math.radians(0.5 * field_deg))
 
 
