@@ -107,3 +107,10 @@ def test_no_test_of_the_service_imports_a_benchmark():
     importing = re.compile(r"^\s*(from|import) benchmarks\b", re.MULTILINE)
     files = Path(__file__).parent.rglob("*.py")
     assert [f.name for f in files if importing.search(f.read_text(encoding="utf-8"))] == []
+
+
+def test_the_service_does_not_import_scipy_stats():
+    """The import takes seconds, and the caller would wait; `scipy.special` has the functions."""
+    importing = re.compile(r"^\s*(from|import) scipy\.stats\b", re.MULTILINE)
+    files = (ROOT / "service").rglob("*.py")
+    assert [name_of(f) for f in files if importing.search(f.read_text(encoding="utf-8"))] == []

@@ -88,13 +88,17 @@ def median(values: Vector, confidence: float = 0.95) -> Interval:
 
     The bounds are infinite with too few values for that confidence (95 %: below six).
     """
-    from scipy.stats import binom
+    # Of `scipy.stats`, which has this quantile of the binomial, the import alone takes seconds.
+    from scipy.special import bdtr, bdtrik
 
     n = len(values)
     ordered = np.sort(values)
     at = float(np.median(values))
     # The true median lies outside the k-th values from either end with at most the rest.
-    k = int(binom.ppf((1.0 - confidence) / 2.0, n, 0.5))
+    tail = (1.0 - confidence) / 2.0
+    k = math.ceil(bdtrik(tail, n, 0.5)) if n else 0
+    if k >= 1 and bdtr(k - 1, n, 0.5) >= tail:
+        k -= 1
     if k < 1:
         return Interval(at, -math.inf, math.inf)
     return Interval(at, float(ordered[k - 1]), float(ordered[n - k]))

@@ -146,10 +146,10 @@ def _worst_in_a_row(squared: vectors.Vector) -> slice | None:
     The rank sum of each run is compared with its expectation (Mann & Whitney); the search is one
     step of circular binary segmentation (Olshen et al. 2004).
     """
-    from scipy.stats import rankdata
-
     count = len(squared)
-    total = np.concatenate([[0.0], np.cumsum(rankdata(squared) - (count + 1) / 2.0)])
+    _, value, times = np.unique(squared, return_inverse=True, return_counts=True)
+    rank = (np.cumsum(times) - (times - 1) / 2.0)[value]
+    total = np.concatenate([[0.0], np.cumsum(rank - (count + 1) / 2.0)])
     best, found = SCAN_SIGMAS, None
     for length in range(LEAST_BATCHES, count - LEAST_BATCHES + 1):
         excess = total[length:] - total[:-length]
@@ -192,10 +192,11 @@ def _latest_with_own_noise(squared: vectors.Vector) -> int:
 
 def _squared_noise(fits: list[TrackerAttitude]) -> vectors.Vector:
     """Estimate of the squared noise from each fit, in units of the squared star sigmas."""
-    from scipy.stats import chi2
+    from scipy.special import gammaincinv
 
     freedom = np.array([fit.degrees_of_freedom for fit in fits])
-    return np.asarray(np.array([fit.taste for fit in fits]) / chi2.median(freedom))
+    median_of_chi_square = 2.0 * gammaincinv(freedom / 2.0, 0.5)
+    return np.asarray(np.array([fit.taste for fit in fits]) / median_of_chi_square)
 
 
 def _size_verdict(now: float, found: Interval) -> SizeVerdict:
