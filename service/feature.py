@@ -25,9 +25,8 @@ Nothing outside the folder of a feature imports it.  Its package holds a `Featur
   serves; `check(settings)` raises `BadConfiguration` before anything is opened.
 - `routes`: `ROUTERS` are its routes of the API.
 - `pages`: importing it registers its pages of the console; its templates and scripts lie in the
-  folders `templates` and `static` of the package.
-- `panels`: `PANELS`, what it adds to pages of others: functions of the `PageContext`, by name of
-  the page; each page says what it takes.
+  folders `templates` and `static` of the package.  `PANELS`, if it is there, is what it adds to
+  pages of others: functions of the `PageContext` by name of the page, which says what it takes.
 - `metrics`: `reads(app)`, functions by name that are called together at each scrape, with a
   deadline; `collect(app, found)` makes metrics of what they returned in time.
 - `telemetry`: reads an input format whose files hold no lines, by its name `FORMAT`.
@@ -75,7 +74,6 @@ KINDS = (
     "serving",
     "routes",
     "pages",
-    "panels",
     "metrics",
     "telemetry",
 )

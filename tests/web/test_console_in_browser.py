@@ -132,6 +132,29 @@ def test_the_first_chart_is_ambiguity_and_few_controls_stand_before_it(browser, 
     assert browser.run("document.querySelector('[data-chart]').getBoundingClientRect().top") < 500
 
 
+def test_the_setting_that_would_help_is_named_on_the_page_of_the_spacecraft(
+    browser, address, full_run
+):
+    browser.open(f"{address}/spacecraft/XTE?run={full_run}")
+    browser.wait(lambda: browser.run(DRAWN))
+    browser.run("document.querySelector('[data-part=best]').click()")
+    shows(browser, "The one setting that would lower it", "#best")
+    assert re.search(r"price|No single setting", text(browser, "#best"))
+    assert browser.run("location.pathname") == "/spacecraft/XTE"
+    # One of the other charts is drawn, or all.
+    menu = "(menu => {{ menu.value = '{}'; menu.dispatchEvent(new Event('change')); }})"
+    shown = (
+        "[...document.querySelectorAll('#other-charts > section')].filter(e => !e.hidden).length"
+    )
+    assert browser.run(shown) > 1
+    browser.run(menu.format("residual") + "(document.getElementById('other-chart'))")
+    browser.wait(lambda: browser.run(shown) == 1)
+    browser.run(menu.format("") + "(document.getElementById('other-chart'))")
+    browser.wait(lambda: browser.run(shown) > 1)
+    assert faults(browser) == []
+    assert browser.complaints == []
+
+
 def test_a_chart_zooms_and_pans_and_the_address_says_where(browser, address, full_run):
     stretch = "start=1999-060T00:00:00Z&end=1999-060T00:20:00Z"
     browser.open(f"{address}/spacecraft/XTE?run={full_run}&{stretch}")
@@ -443,7 +466,7 @@ def test_where_the_service_does_not_answer_people_are_told_what_to_do(
     browser.open(f"{address}/runs?run={run}")
     browser.wait(lambda: browser.run(CONNECTED))
     offline(True)
-    click(browser, "[data-watch]")
+    click(browser, "[data-send]")
     told("#message", "Not done")
     offline(False)
 
@@ -496,7 +519,8 @@ def test_no_label_of_a_chart_is_cut_off(browser, address, client, drawn, width, 
     run = f"labels-{width}"
     for each in drawn("XTE", 20, seed=4):
         client.post("/api/v1/batches", json=each | {"run": run}).raise_for_status()
-    added = browser.call("Page.addScriptToEvaluateOnNewDocument", source=WRITTEN)
+    every = "localStorage.setItem('other-chart', '');"
+    added = browser.call("Page.addScriptToEvaluateOnNewDocument", source=every + WRITTEN)
     try:
         query = {"run": run, "start": start, "end": end}
         browser.open(str(httpx.URL(f"{address}/spacecraft/XTE", params=query)), width=width)
@@ -504,6 +528,7 @@ def test_no_label_of_a_chart_is_cut_off(browser, address, client, drawn, width, 
         written = browser.run("written")
     finally:
         browser.call("Page.removeScriptToEvaluateOnNewDocument", **added)
+        browser.run("localStorage.clear()")
     assert {"stars", "magnitude"} <= {each["chart"] for each in written}
     assert any(each["isLimit"] for each in written)
     sides = ("left", "right", "top", "bottom")

@@ -160,7 +160,7 @@ def test_the_advice_for_an_alarm_tells_how_noisy_the_tracker_was_though_it_has_r
             if (each["tracker"], each["quantity"]) == (SECOND, "residual_ratio")
         ]
         page = client.get(f"/alarms/{own}").text
-        (link,) = re.findall(r'href="/advice/XTE([^"]*)">Advice for that time', page)
+        (link,) = re.findall(r'href="/advice/XTE([^"]*)">advice for that time', page)
         query = html.unescape(link)
         (said,) = re.findall(f"Noise of {SECOND} is [^<]*", client.get(f"/advice/XTE{query}").text)
         advice = client.get(f"/api/v1/spacecraft/XTE/advice{query}").raise_for_status().json()

@@ -414,7 +414,7 @@ def test_the_page_of_a_running_replay_has_a_button_that_cancels_it(
     client, address, running, browser
 ):
     page = f"{address}{running.removeprefix('/api/v1')}"
-    button = "document.querySelector('[data-cancel]')"
+    button = "document.querySelector('[data-send]')"
     browser.open(page)
     browser.wait(lambda: browser.run(f"{button} !== null"))
     browser.run(f"{button}.click()")
@@ -429,4 +429,4 @@ def test_the_page_of_a_running_replay_has_a_button_that_cancels_it(
 def test_the_page_of_a_replay_that_has_ended_has_no_such_button(client, batch, run):
     place = begun(client, run, json.dumps(batch).encode())
     ended(client, place)
-    assert "data-cancel" not in client.get(place.removeprefix("/api/v1")).text
+    assert "data-send" not in client.get(place.removeprefix("/api/v1")).text

@@ -2,4 +2,4 @@
 
 from service.feature import Feature
 
-FEATURE = Feature("advice", __name__, ("part", "command", "routes", "pages", "panels"))
+FEATURE = Feature("advice", __name__, ("part", "command", "routes", "pages"))

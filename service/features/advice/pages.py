@@ -1,7 +1,7 @@
-"""Console page with advice on the settings of a mission."""
+"""Console page with advice on the settings of a mission, and panel on ambiguous stars."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 from urllib.parse import urlencode
 
@@ -12,7 +12,8 @@ from starlette.responses import Response
 from service.features.advice.part import AdviceService, best_setting, no_changes_text
 from service.features.advice.routes import ADVICE_LIMIT_S, MAX_SAMPLE, AdviceQuery
 from service.missions.mission import Tolerances
-from service.web.console.page import ContextDep, FromQuery, console_page
+from service.web.console.page import ContextDep, FromQuery, PageContext, Panel, console_page
+from service.web.console.pages.spacecraft import PeriodBefore, ShownPeriod
 from service.web.requests.access import Policy
 
 FIRST_SAMPLE, FIRST_LIMIT_S = 60, 1.5
@@ -76,3 +77,17 @@ def advice_page(name: str, query: FromQuery[AdviceForm], context: ContextDep) ->
         tolerances=list(Tolerances.model_fields),
         no_changes=no_changes_text(advice),
     )
+
+
+def ambiguity_of_period(
+    context: PageContext, name: str, run: str, shown: ShownPeriod, before: PeriodBefore
+) -> Iterator[Panel]:
+    """Panel that compares ambiguous stars of a period with an earlier one, with causes."""
+    found = context.app.part(AdviceService).ambiguity(
+        name, run, shown.start, shown.end, before.shift_s
+    )
+    if found.parts:
+        yield Panel("_ambiguity.html.jinja", found)
+
+
+PANELS = {"ambiguity": ambiguity_of_period}

@@ -14,7 +14,6 @@ FEATURE = Feature(
         "serving",
         "routes",
         "pages",
-        "panels",
         "metrics",
     ),
 )

@@ -1,10 +1,11 @@
-"""Console pages for alarms: list, single alarm with history, limits of a spacecraft."""
+"""Console pages for alarms: list, single alarm with history, limits, also on charts of trends."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from msgspec import structs
 from starlette.responses import Response
 
 from service.contract.alarms import Alarm, Limit, SeverityName
@@ -26,11 +27,17 @@ from service.web.console.page import (
     SortedQuery,
     console_page,
 )
-from service.web.console.pages.spacecraft import charts_by_quantity, history_address
+from service.web.console.pages.spacecraft import (
+    DrawnLimits,
+    ShownPeriod,
+    charts_by_quantity,
+    history_address,
+)
 from service.web.requests.access import Policy
 from service.web.requests.query_parameters import Cursor, Query
 
 ROWS = 200
+SEVERITIES = [each.word for each in Severity]
 State = Literal["active", "open", "returned", "acknowledged", "shelved", "cleared", "all"]
 STATES: dict[State, str] = {
     "active": "not cleared",
@@ -105,10 +112,7 @@ class AlarmGroup:
 @console_page("/alarms", "Alarms", Policy("read", "nothing"), position=20)
 def alarms_page(query: FromQuery[AlarmsQuery], context: ContextDep) -> Response:
     """Console page with the alarms of a run, the latest violation first."""
-    if query.spacecraft:
-        context.caller.require(query.spacecraft)
-    elif context.caller.spacecraft is not None:
-        query = query.model_copy(update={"spacecraft": context.first_spacecraft})
+    query = query.model_copy(update={"spacecraft": context.listed(query.spacecraft)})
     found, next_cursor = _found(context, query)
     lines = [
         AlarmLine(alarm, times)
@@ -123,7 +127,7 @@ def alarms_page(query: FromQuery[AlarmsQuery], context: ContextDep) -> Response:
         left_out=max(0, len(lines) - ROWS),
         next_cursor=next_cursor,
         states=STATES,
-        severities=[each.word for each in Severity],
+        severities=SEVERITIES,
         groupings=GROUPINGS,
         spacecraft=context.spacecraft,
         is_retired=context.app.part(Alarms).is_retired,
@@ -302,7 +306,6 @@ def _trend(context: PageContext, alarm: AlarmWithActions) -> AlarmTrend | None:
     )
 
 
-SEVERITIES = ("watch", "warning", "critical")
 PREVIEW_DAYS = (1, 7, 30)
 
 
@@ -329,3 +332,25 @@ def limits_page(name: str, query: FromQuery[LimitsQuery], context: ContextDep) -
         charts=charts_by_quantity(),
         may_write=context.may_operate,
     )
+
+
+def limits_of_charts(
+    context: PageContext, name: str, run: str, tracker: str | None, shown: ShownPeriod | None
+) -> Iterator[DrawnLimits]:
+    """Limits of a spacecraft or tracker, and intervals in which alarms were out of limits.
+
+    For a tracker, its own alarms and alarms of all trackers are included.
+    """
+    alarms, limited = context.app.part(Alarms), limited_trackers(context.app.context.known[name])
+    limits = alarms.limits.all(name, tracker if tracker in limited else None)
+    out = []
+    if shown is not None:
+        out = [
+            structs.asdict(each)
+            for each in alarms.of_period(name, run, shown.start, shown.end)
+            if tracker is None or each.tracker in (None, tracker)
+        ]
+    yield DrawnLimits(limits, out)
+
+
+PANELS = {"spacecraft_page": limits_of_charts}

@@ -1,10 +1,6 @@
-"""Console page for the calibration of a spacecraft: results, proposed changes, settings in force.
+"""Console page for the calibration of a spacecraft: results, changes, settings in force."""
 
-A chart shows the parameters of trackers over the versions of a calibration, with their sigmas.
-"""
-
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
 from typing import Annotated
 
 import numpy as np
@@ -23,69 +19,23 @@ from service.ingest.missions_in_force import geometry_of
 from service.missions.mission import AS_MEASURED, Mission
 from service.sky.catalog.run_catalog import UNKNOWN_COLOR_BV_MAG
 from service.storage.recording.unsaved_result import LIVE
-from service.times import parse_utc
 from service.vectors import ARCSEC_PER_RADIAN
 from service.web.console.page import ContextDep, FromQuery, PageContext, PageQuery, console_page
 from service.web.requests.access import Policy
 
-WIDTH, HEIGHT, PAD = 420.0, 96.0, 10.0
-SIGMAS = 1.0
 STAR_MAG = 5.0
 """V magnitude of the star, with the Sun's colour, at which zero points are compared."""
 
 
-@dataclass(frozen=True)
-class Point:
-    """Value of a parameter in one version of a calibration; `low` and `high` end its error bar."""
-
-    version: int
-    time: str
-    value: float
-    sigma: float
-    x: float = 0.0
-    y: float = 0.0
-    low: float = 0.0
-    high: float = 0.0
-
-
-@dataclass(frozen=True)
-class ParameterHistory:
-    """Chart of a parameter against the time of its batches, from `bottom` to `top` in value."""
-
-    name: str
-    unit: str
-    points: tuple[Point, ...]
-    top: float
-    bottom: float
-    width: float = WIDTH
-    height: float = HEIGHT
-
-    @property
-    def line(self) -> str:
-        """SVG path through all points of the chart."""
-        places = (f"{each.x:.1f} {each.y:.1f}" for each in self.points)
-        return "M" + "L".join(places)
-
-
-def parameter_histories(
-    versions: Sequence[CalibrationSummary], file: Mission
-) -> list[ParameterHistory]:
-    """Charts of alignment, scale, magnitudes and time tags over all completed calibration versions.
+def parameters(found: CalibrationSummary, file: Mission) -> dict[str, tuple[float, float]]:
+    """Alignment, scale, magnitudes and time tags of a calibration version, each with its sigma.
 
     All values are relative to the mission file, whatever settings were in force at the estimate.
     """
-    found: dict[tuple[str, str], list[Point]] = {}
-    for each in versions:
-        if each.state == "done" and each.first is not None:
-            for name, unit, point in _points(each, file):
-                found.setdefault((name, unit), []).append(point)
-    return [_drawn(name, unit, points) for (name, unit), points in sorted(found.items())]
-
-
-def _points(found: CalibrationSummary, file: Mission) -> Iterator[tuple[str, str, Point]]:
     own = {each.name: each for each in found.trackers}
     files = {each.name: each for each in file.trackers}
     files_geometry = [geometry_of(each) for each in file.trackers]
+    values = {}
     for each in found.unknowns:
         if each.tracker not in own or each.tracker not in files:
             continue
@@ -101,8 +51,8 @@ def _points(found: CalibrationSummary, file: Mission) -> Iterator[tuple[str, str
             value -= _of_magnitudes(each.name, files_geometry, each.tracker)
         else:
             continue
-        point = Point(found.version, found.first or "", value, each.sigma)
-        yield each.name, "" if each.unit == "1" else each.unit, point
+        values[each.name if each.unit == "1" else f"{each.name}, {each.unit}"] = value, each.sigma
+    return values
 
 
 def _of_magnitudes(name: str, trackers: Sequence[TrackerGeometry], tracker: str) -> float:
@@ -125,33 +75,6 @@ def _turned_arcsec(tracker: TrackerGeometry, before: np.ndarray) -> list[float]:
     turn = np.column_stack(axes) @ before.T
     vector = [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
     return [float(part) / 2.0 * ARCSEC_PER_RADIAN for part in vector]
-
-
-def _drawn(name: str, unit: str, points: Sequence[Point]) -> ParameterHistory:
-    ordered = sorted(points, key=lambda each: (each.time, each.version))
-    top = max(each.value + SIGMAS * each.sigma for each in ordered)
-    bottom = min(each.value - SIGMAS * each.sigma for each in ordered)
-    times = np.array([parse_utc(each.time).tai_ns for each in ordered], dtype=float)
-    # Versions of one stretch would lie upon each other.
-    places = times if len(set(times)) == len(times) else np.arange(float(len(times)))
-    spread = places[-1] - places[0]
-    xs = (places - places[0]) / spread if spread else np.full(len(places), 0.5)
-
-    def y_of(value: float) -> float:
-        part = (value - bottom) / (top - bottom) if top > bottom else 0.5
-        return HEIGHT - PAD - part * (HEIGHT - 2.0 * PAD)
-
-    drawn = tuple(
-        replace(
-            each,
-            x=PAD + float(x) * (WIDTH - 2.0 * PAD),
-            y=y_of(each.value),
-            low=y_of(each.value - SIGMAS * each.sigma),
-            high=y_of(each.value + SIGMAS * each.sigma),
-        )
-        for each, x in zip(ordered, xs, strict=True)
-    )
-    return ParameterHistory(name, unit, drawn, top, bottom)
 
 
 SHOWN = 50
@@ -192,7 +115,7 @@ def calibration_page(
         and any(abs(each.value) > each.sigma for each in result.unknowns),
         trackers=app.adoptions.file_of(name).trackers,
         recorded=_recorded(context, name),
-        histories=parameter_histories(versions, app.adoptions.file_of(name)),
+        parameters={each.id: parameters(each, app.adoptions.file_of(name)) for each in versions},
         largest_degree=LARGEST_DEGREE,
         sample=CALIBRATION_SAMPLE,
         may_write=context.may_operate,

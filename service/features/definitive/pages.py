@@ -56,7 +56,6 @@ def grades_page(name: str, query: FromQuery[SpacecraftQuery], context: ContextDe
         query.run,
         name=name,
         missing=without_gyro(context, name, query.run, shown) if shown else "",
-        panels=context.panels("grades_page", name, query.run, shown) if shown else [],
         stretch=shown,
         ranges=list(RANGES_S),
         drawn=drawn,

@@ -2,4 +2,4 @@
 
 from service.feature import Feature
 
-FEATURE = Feature("products", __name__, ("part", "command", "routes", "pages", "panels"))
+FEATURE = Feature("products", __name__, ("part", "command", "routes", "pages"))

@@ -2,4 +2,4 @@
 
 from service.feature import Feature
 
-FEATURE = Feature("tracks", __name__, ("part", "command", "routes", "panels"))
+FEATURE = Feature("tracks", __name__, ("part", "command", "routes", "pages"))

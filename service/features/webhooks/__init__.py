@@ -5,5 +5,5 @@ from service.feature import Feature
 FEATURE = Feature(
     "webhooks",
     __name__,
-    ("tables", "part", "serving", "routes", "pages", "panels", "metrics"),
+    ("tables", "part", "serving", "routes", "pages", "metrics"),
 )

@@ -17,6 +17,7 @@ from fastapi.routing import APIRoute
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined, pass_context
 from jinja2.runtime import Context
 from markupsafe import Markup
+from pydantic import Field
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import HTMLResponse, Response
@@ -99,6 +100,21 @@ class PageQuery(Query):
 def typed_utc(text: str, field: str) -> Utc:
     """A time as people type it; raises `BadInput` naming the field."""
     return parse_utc(completed_utc(text), field)
+
+
+class PeriodQuery(PageQuery):
+    """A period as people type it; an empty field stands for any time."""
+
+    start: Annotated[str, Field(max_length=40)] = ""
+    end: Annotated[str, Field(max_length=40)] = ""
+
+    @property
+    def bounds(self) -> dict[str, Utc | None]:
+        """Both ends by name; raises `BadInput` for what is no time."""
+        typed = {"start": self.start, "end": self.end}
+        return {
+            name: typed_utc(text, name) if text.strip() else None for name, text in typed.items()
+        }
 
 
 class SortedQuery(PageQuery):
@@ -230,8 +246,8 @@ class PageContext:
 
     def panels(self, page: str, *shown: Any) -> list[Any]:
         """What features add to a page, by the name of its handler; `shown` is what it shows."""
-        modules = feature_modules("panels", self.app.settings.features_off)
-        makers = (module.PANELS.get(page) for module in modules)
+        modules = feature_modules("pages", self.app.settings.features_off)
+        makers = (getattr(module, "PANELS", {}).get(page) for module in modules)
         return [panel for make in makers if make is not None for panel in make(self, *shown)]
 
     def _layout(self, run: str) -> Layout:
@@ -273,6 +289,14 @@ class PageContext:
         A token may be bound to spacecraft alone that have no mission file any more.
         """
         return (self.spacecraft or sorted(self.caller.spacecraft or ()))[0]
+
+    def listed(self, spacecraft: str) -> str:
+        """The spacecraft of a list: the asked one; empty for all, of which some see one alone."""
+        if spacecraft:
+            self.caller.require(spacecraft)
+        elif self.caller.spacecraft is not None:
+            return self.first_spacecraft
+        return spacecraft
 
     def filled_spacecraft(self, run: str) -> str:
         """The first spacecraft with batches in a run; without any, the first one."""

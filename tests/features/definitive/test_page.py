@@ -261,7 +261,11 @@ def test_a_chart_is_read_at_a_moment_and_zoomed_by_dragging(browser, address):
     browser.wait(lambda: browser.run("location.search").count("start=") == 1)
     browser.wait(lambda: browser.run("document.readyState") == "complete")
     assert browser.run(bounds) == pytest.approx(0.5 * length_s, rel=0.03)
-    links = browser.run("[...document.querySelectorAll('#grades a[download]')].map(e => e.href)")
+    # The files of the same period are a link away.
+    browser.run("document.querySelector('#steps a[href*=\"/files\"]').click()")
+    browser.wait(lambda: browser.run("location.pathname").endswith("/files"))
+    browser.wait(lambda: browser.run("document.readyState") == "complete")
+    links = browser.run("[...document.querySelectorAll('a[download]')].map(e => e.href)")
     smoothed = [each for each in links if "grade=smoothed" in each and "format=csv" in each]
     assert httpx.get(smoothed[0]).is_success
     assert browser.complaints == []

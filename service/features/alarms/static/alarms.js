@@ -1,19 +1,22 @@
-// Acknowledges or shelves many alarms at once: each is a request of its own, with its own outcome.
+// Acts on the selected alarms of a list, or on the alarm of a page: each is a request of its own.
 import { attempt, rememberWho, send } from "./actions.js";
 import { refreshSoon } from "./live_updates.js";
 
 const AT_ONCE = 4;
-const ALLOWED = { acknowledge: ["open", "shelved"], shelve: ["open", "acknowledged"] };
-const DONE = { acknowledge: "acknowledged", shelve: "shelved" };
-const form = document.getElementById("bulk");
+// The states in which an action applies; a comment always does.
+const ALLOWED = { acknowledge: ["open", "shelved"], shelve: ["open", "acknowledged"], unshelve: ["shelved"] };
+const DONE = { acknowledge: "acknowledged", shelve: "shelved", unshelve: "unshelved", comment: "commented" };
+const form = document.querySelector("#bulk, #act-form");
 const message = document.getElementById("message");
-const selected = new Set();
+// The alarm of a page stays selected.
+const only = form?.dataset.id;
+const selected = new Set(only ? [only] : []);
 
-const boxes = () => [...document.querySelectorAll("[data-select]")];
+const shown = () => [...document.querySelectorAll("[data-select]")];
 
 // The list is replaced by newer ones: what was selected stays so.
 function mark() {
-  const here = boxes();
+  const here = shown();
   for (const id of selected) if (!here.some((each) => each.dataset.select === id)) selected.delete(id);
   for (const each of here) each.checked = selected.has(each.dataset.select);
   for (const button of form.querySelectorAll("[data-act]")) button.disabled = ids(button.dataset.act).length === 0;
@@ -25,7 +28,7 @@ function mark() {
 
 // The selected alarms that an action applies to.
 function ids(action) {
-  const apt = boxes().filter((each) => each.checked && ALLOWED[action].includes(each.dataset.state));
+  const apt = shown().filter(({ dataset: { select, state } }) => selected.has(select) && (ALLOWED[action]?.includes(state) ?? true));
   return apt.map((each) => each.dataset.select);
 }
 
@@ -35,7 +38,7 @@ async function sendAll(waiting, action, body) {
     for (let id = waiting.pop(); id !== undefined; id = waiting.pop()) {
       try {
         await send("POST", `/api/v1/alarms/${id}/${action}`, JSON.stringify(body));
-        selected.delete(id);
+        if (!only) selected.delete(id);
       } catch (error) {
         refused.push(error.message);
       }
@@ -49,7 +52,7 @@ if (form) {
   rememberWho(form.elements.who);
   document.addEventListener("change", (event) => {
     if (event.target.matches("[data-select-all]")) {
-      for (const each of boxes()) event.target.checked ? selected.add(each.dataset.select) : selected.delete(each.dataset.select);
+      for (const each of shown()) event.target.checked ? selected.add(each.dataset.select) : selected.delete(each.dataset.select);
     } else if (event.target.matches("[data-select]")) {
       const { select } = event.target.dataset;
       event.target.checked ? selected.add(select) : selected.delete(select);
@@ -70,7 +73,7 @@ if (form) {
     attempt(null, message, async () => {
       const refused = await sendAll(waiting, action, body);
       refreshSoon();
-      if (refused.length) throw new Error(`${refused.length} of ${count}; the first: ${refused[0]}`);
+      if (refused.length) throw new Error(count === 1 ? refused[0] : `${refused.length} of ${count}; the first: ${refused[0]}`);
       comment.value = "";
       return `${count} ${DONE[action]}.`;
     });

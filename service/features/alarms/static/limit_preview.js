@@ -1,5 +1,6 @@
 // The preview of a limit: what it would have done to recorded batches, in words and on the trend.
 import { posix, utc } from "./times.js";
+import { element } from "./actions.js";
 import { requestJson } from "./requests.js";
 import { Trend } from "./trend.js";
 
@@ -7,21 +8,13 @@ const POINTS = 240;
 const MOST_LISTED = 8;
 const charts = JSON.parse(document.querySelector("[data-json]").content.textContent);
 
-function element(name, text, className = "") {
-  const made = document.createElement(name);
-  made.textContent = text;
-  if (className) made.className = className;
-  return made;
-}
-
 function holderOf(quantity) {
   return document.getElementById(`preview-${quantity}`);
 }
 
 // Shows an empty preview; returns the line that tells its state.
 export function beginPreview(quantity) {
-  const status = element("p", "");
-  status.setAttribute("role", "status");
+  const status = element("p", { role: "status" });
   holderOf(quantity).replaceChildren(status);
   holderOf(quantity).hidden = false;
   return status;
@@ -53,17 +46,15 @@ function listOf(excursions, measure) {
   list.start = Math.max(0, excursions.length - MOST_LISTED) + 1;
   for (const each of excursions.slice(-MOST_LISTED)) {
     const end = each.end === null ? "to the end" : `to ${utc(posix(each.end))} UTC`;
-    list.append(element("li", `${each.severity}, ${utc(posix(each.start))} UTC ${end}: ${value(each.worst, measure)}, bound ${value(each.bound, measure)}`));
+    list.append(element("li", {}, `${each.severity}, ${utc(posix(each.start))} UTC ${end}: ${value(each.worst, measure)}, bound ${value(each.bound, measure)}`));
   }
   return list;
 }
 
 // The trend over the same batches, with the bounds that are tried and the times beyond them.
 async function draw(holder, found, chart) {
-  const readout = element("p", "\u00a0", "readout soft");
-  const place = element("div", "", "chart");
-  place.tabIndex = 0;
-  place.setAttribute("role", "img");
+  const readout = element("p", { className: "readout soft" }, "\u00a0");
+  const place = element("div", { className: "chart", tabIndex: 0, role: "img" });
   holder.append(readout, place);
   const query = new URLSearchParams({ quantity: found.quantity, run: found.run, start: found.start, size: POINTS });
   // The latest batch belongs to the period, whose end does not.
@@ -81,14 +72,14 @@ export async function showPreview(found, measure) {
   const holder = holderOf(found.quantity);
   const chart = charts[found.quantity];
   if (!found.batches) {
-    holder.append(element("p", "There is no batch in these days."));
+    holder.append(element("p", {}, "There is no batch in these days."));
     return;
   }
   const cut = found.is_cut ? ", the latest of more" : "";
   holder.append(
-    element("p", `${found.batches} batches${cut}, ${utc(posix(found.start))} to ${utc(posix(found.end))} UTC.`, "soft"),
-    element("p", sentence("These limits", found.proposed)),
-    element("p", sentence("The limits in force", found.in_force)),
+    element("p", { className: "soft" }, `${found.batches} batches${cut}, ${utc(posix(found.start))} to ${utc(posix(found.end))} UTC.`),
+    element("p", {}, sentence("These limits", found.proposed)),
+    element("p", {}, sentence("The limits in force", found.in_force)),
     listOf(found.proposed.excursions, measure),
   );
   if (chart) await draw(holder, found, chart);

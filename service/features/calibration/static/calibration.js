@@ -1,9 +1,8 @@
 // Calibrates, tries a calibration over recorded batches, adopts it, and takes it back.
-import { attempt, rememberWho, send } from "./actions.js";
+import { attempt, element, ended, rememberWho, send } from "./actions.js";
 import { refreshSoon } from "./live_updates.js";
 import { signed as signedBy } from "./sign.js";
 
-const POLL_MS = 500;
 const message = document.getElementById("message");
 const signed = document.getElementById("signed");
 const form = document.getElementById("calibrate");
@@ -16,20 +15,6 @@ if (signed) {
 
 function author() {
   return signed.elements.who.value.trim();
-}
-
-function pause(milliseconds) {
-  return new Promise((resolve) => setTimeout(resolve, milliseconds));
-}
-
-// Waits for a calibration, and draws the page anew as it goes on.
-async function finished(id) {
-  for (;;) {
-    const found = await send("GET", `/api/v1/calibrations/${id}`);
-    if (found.state !== "queued" && found.state !== "running") return found;
-    message.textContent = `Version ${found.version}: ${found.done} of ${found.total} batches.`;
-    await pause(POLL_MS);
-  }
 }
 
 form?.addEventListener("submit", (event) => {
@@ -51,7 +36,9 @@ form?.addEventListener("submit", (event) => {
       time_tag: timeTag.checked,
       who: author(),
     }));
-    const found = await finished(begun.id);
+    const found = await ended(`/api/v1/calibrations/${begun.id}`, ({ state }) => !["queued", "running"].includes(state), ({ version, done, total }) => {
+      message.textContent = `Version ${version}: ${done} of ${total} batches.`;
+    });
     if (found.state !== "done") throw new Error(found.fault ?? found.state);
     const here = new URL(location.href);
     here.searchParams.set("version", found.version);
@@ -72,24 +59,12 @@ function share(part, whole) {
   return whole ? `${part} of ${whole} (${((100 * part) / whole).toFixed(1)} %)` : "–";
 }
 
-function cell(kind, text, className = "") {
-  const made = document.createElement(kind);
-  made.textContent = text;
-  made.className = className;
-  if (kind === "th") made.scope = className ? "col" : "row";
-  return made;
-}
-
 function showTrial(found) {
-  const table = document.createElement("table");
-  table.createCaption().textContent = `${found.compared} of ${found.batches_in_stretch} batches${found.cut_short ? ", stopped after ten seconds" : ""}`;
-  const head = table.createTHead().insertRow();
-  head.append(document.createElement("td"), cell("th", "in force", "number"), cell("th", "with this calibration", "number"));
-  const body = table.createTBody();
-  for (const [name, text] of SHOWN) {
-    body.insertRow().append(cell("th", name), cell("td", text(found.a, found), "number"), cell("td", text(found.b, found), "number"));
-  }
-  trial.replaceChildren(table);
+  const caption = `${found.compared} of ${found.batches_in_stretch} batches${found.cut_short ? ", stopped after ten seconds" : ""}`;
+  const number = (kind, textContent) => element(kind, { textContent, className: "number", scope: "col" });
+  const head = element("tr", {}, element("td"), number("th", "in force"), number("th", "with this calibration"));
+  const rows = SHOWN.map(([name, text]) => element("tr", {}, element("th", { textContent: name, scope: "row" }), number("td", text(found.a, found)), number("td", text(found.b, found))));
+  trial.replaceChildren(element("table", {}, element("caption", { textContent: caption }), element("thead", {}, head), element("tbody", {}, ...rows)));
   trial.hidden = false;
 }
 

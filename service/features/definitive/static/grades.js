@@ -1,25 +1,17 @@
 // Makes the definitive attitude of a period, and shows how far it is; charts are read and zoomed.
-import { attempt, rememberWho, send } from "./actions.js";
+import { attempt, ended, rememberWho, send } from "./actions.js";
 import { refreshSoon } from "./live_updates.js";
 import { posix, utc } from "./times.js";
 
-const POLL_MS = 500;
 const form = document.getElementById("definitive");
 const message = document.getElementById("message");
 const bar = document.getElementById("definitive-progress");
-const pause = () => new Promise((resolve) => setTimeout(resolve, POLL_MS));
 
-async function finished(address, job) {
-  while (job.ended === null) {
-    bar.hidden = false;
-    bar.max = job.total || 1;
-    bar.value = job.done;
-    message.textContent = job.total ? `${job.done} of ${job.total} days.` : `${job.state}…`;
-    await pause();
-    job = await send("GET", `${address}/${job.id}`);
-  }
-  bar.hidden = true;
-  return job;
+function tell(job) {
+  bar.hidden = false;
+  bar.max = job.total || 1;
+  bar.value = job.done;
+  message.textContent = job.total ? `${job.done} of ${job.total} days.` : `${job.state}…`;
 }
 
 if (form) {
@@ -30,7 +22,9 @@ if (form) {
     const address = `/api/v1/spacecraft/${encodeURIComponent(form.dataset.spacecraft)}/definitive-attitude`;
     attempt(event.submitter, message, async () => {
       const wanted = { run: document.body.dataset.run, start: start.value.trim() || null, end: end.value.trim() || null, who: who.value.trim() };
-      const job = await finished(address, await send("POST", address, JSON.stringify(wanted)));
+      const { id } = await send("POST", address, JSON.stringify(wanted));
+      const job = await ended(`${address}/${id}`, (each) => each.ended !== null, tell);
+      bar.hidden = true;
       if (job.state !== "done") throw new Error(job.fault ?? job.state);
       refreshSoon();
       return `Done: ${job.recorded} of ${job.total} days have a new revision${job.fault ? `; ${job.fault}` : ""}.`;

@@ -1,4 +1,4 @@
-// Registers, tries out, pauses and deletes webhooks, and sends events again.
+// Registers, tries out, pauses and deletes webhooks.
 import { attempt, send } from "./actions.js";
 import { refreshSoon } from "./live_updates.js";
 
@@ -55,20 +55,6 @@ document.addEventListener("click", (event) => {
     const said = await ACTIONS[button.dataset.do](address);
     refreshSoon();
     return said;
-  });
-});
-
-document.addEventListener("submit", (event) => {
-  const form = event.target.closest("[data-replay]");
-  if (!form) return;
-  event.preventDefault();
-  const { since, until } = form.elements;
-  const address = `${HERE}/${form.closest("[data-webhook]").dataset.webhook}/replay`;
-  attempt(event.submitter, message, async () => {
-    const body = { since: since.value.trim(), until: until.value.trim() || null };
-    const { queued } = await send("POST", address, JSON.stringify(body));
-    refreshSoon();
-    return `Events queued: ${queued}.`;
   });
 });
 

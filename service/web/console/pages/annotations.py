@@ -1,14 +1,13 @@
 """The page of annotations: notes of people on times and periods."""
 
-from typing import Annotated, Literal
+from typing import Literal
 
-from pydantic import Field
 from starlette.responses import Response
 
 from service.contract.alarms import Annotation
 from service.observations.schema import Key
 from service.times import recorded_utc, shifted
-from service.web.console.page import ContextDep, FromQuery, PageQuery, console_page, typed_utc
+from service.web.console.page import ContextDep, FromQuery, PeriodQuery, console_page
 from service.web.requests.access import Policy
 from service.web.requests.query_parameters import Cursor
 
@@ -17,31 +16,20 @@ AROUND_S = 1800.0
 """Before and after an annotation: what the link to the trends shows."""
 
 
-class AnnotationsQuery(PageQuery):
+class AnnotationsQuery(PeriodQuery):
     """Which annotations; an empty field of the form stands for any value."""
 
     spacecraft: Key | Literal[""] = ""
-    start: Annotated[str, Field(max_length=40)] = ""
-    end: Annotated[str, Field(max_length=40)] = ""
     cursor: Cursor = None
-
-    @property
-    def filters(self) -> dict[str, str | None]:
-        """The filters, without the run and the cursor."""
-        return {name: getattr(self, name) or None for name in ("spacecraft", "start", "end")}
 
 
 @console_page("/annotations", "Annotations", Policy("read", "nothing"), position=25)
 def annotations_page(query: FromQuery[AnnotationsQuery], context: ContextDep) -> Response:
     """The annotations of a period, the latest written first."""
-    if query.spacecraft:
-        context.caller.require(query.spacecraft)
-    elif context.caller.spacecraft is not None:
-        query = query.model_copy(update={"spacecraft": context.first_spacecraft})
+    query = query.model_copy(update={"spacecraft": context.listed(query.spacecraft)})
     page = context.app.annotations.page(
         spacecraft=query.spacecraft or None,
-        start=typed_utc(query.start, "start") if query.start else None,
-        end=typed_utc(query.end, "end") if query.end else None,
+        **query.bounds,
         limit=ANNOTATION_ROWS,
         cursor=query.cursor,
     )

@@ -39,6 +39,7 @@ from service.web.console.page import (
     FromQuery,
     PageContext,
     PageQuery,
+    PeriodQuery,
     console_page,
     typed_utc,
 )
@@ -255,32 +256,21 @@ Any_ = Literal[""]
 """An empty field of a form: any value."""
 
 
-class BatchesQuery(PageQuery):
+class BatchesQuery(PeriodQuery):
     """Which batches; empty fields of the form are left out."""
 
     spacecraft: Key | Any_ = ""
     outcome: OutcomeName | Any_ = ""
     status: StatusName | Any_ = ""
-    start: Annotated[str, Field(max_length=40)] = ""
-    end: Annotated[str, Field(max_length=40)] = ""
     find: Annotated[str, Field(max_length=200)] = ""
     """The id that a batch has of its sender, or of this service; or a time."""
     cursor: Cursor = None
-
-    @property
-    def filters(self) -> dict[str, str | None]:
-        """The filters, without the run and the cursor."""
-        names = ("spacecraft", "outcome", "status", "start", "end")
-        return {name: getattr(self, name) or None for name in names}
 
 
 @console_page("/batches", "Batches", Policy("read", "nothing"), position=30)
 def batches_page(query: FromQuery[BatchesQuery], context: ContextDep) -> Response:
     """The batches of a run, newest first."""
-    if query.spacecraft:
-        context.caller.require(query.spacecraft)
-    elif context.caller.spacecraft is not None:
-        query = query.model_copy(update={"spacecraft": context.first_spacecraft})
+    query = query.model_copy(update={"spacecraft": context.listed(query.spacecraft)})
     moment, nearest = None, list[tuple[Summary, float]]()
     if text := query.find.strip():
         try:
@@ -298,8 +288,8 @@ def batches_page(query: FromQuery[BatchesQuery], context: ContextDep) -> Respons
         page = context.app.results.page(
             spacecraft=query.spacecraft or None,
             run=query.run,
-            start=typed_utc(query.start, "start") if query.start else None,
-            end=typed_utc(query.end, "end") if query.end else None,
+            start=query.bounds["start"],
+            end=query.bounds["end"],
             outcome=query.outcome or None,
             status=query.status or None,
             limit=ROWS,

@@ -3,16 +3,16 @@
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from fastapi import Depends
-from pydantic import Field, ValidationError
+from pydantic import ValidationError
 from starlette.requests import Request
 from starlette.responses import Response
 
 from service.app.runs import MOST_COMPARED
-from service.contract.runs import Comparison, RefusedLine
+from service.contract.runs import Comparison, RefusedLine, RunComparison
 from service.errors import BadBatch
 from service.observations.schema import Key, OptionsIn, RunName
 from service.times import DAY_S, recorded_utc, unix_seconds, utc_now
@@ -20,7 +20,7 @@ from service.vectors import Vector
 from service.web.api.batches import COMPARISON_S, SampleSize
 from service.web.console import options
 from service.web.console.charts.sparkline import SparklineDrawing, common_top, sparkline
-from service.web.console.page import ContextDep, FromQuery, PageQuery, console_page, typed_utc
+from service.web.console.page import ContextDep, FromQuery, PageQuery, PeriodQuery, console_page
 from service.web.requests.access import READ, Policy
 
 SAMPLE = 2_000
@@ -31,16 +31,14 @@ SPARK_SIZE = 360, 36
 """Pixels: a year has a point a day."""
 
 
-class CompareQuery(PageQuery):
+class CompareQuery(PeriodQuery):
     """Which batches; the options of the sides are parameters with the prefixes `a.` and `b.`.
 
     With `other` the run is compared with that run, in the period or in all that both have.
     """
 
-    other: RunName | None = None
+    other: RunName | Literal[""] = ""
     spacecraft: Key | None = None
-    start: Annotated[str, Field(max_length=40)] = ""
-    end: Annotated[str, Field(max_length=40)] = ""
     sample: SampleSize = SAMPLE
 
 
@@ -73,20 +71,17 @@ def compare_page(
     request: Request, query: Annotated[CompareQuery, Depends(_query)], context: ContextDep
 ) -> Response:
     """A comparison of the shown run with another, or of two sets of options, once asked for."""
-    start, end = (
-        typed_utc(text, name) if text.strip() else None
-        for name, text in (("start", query.start), ("end", query.end))
-    )
+    start, end = query.bounds.values()
     name = query.spacecraft or context.filled_spacecraft(query.run)
     runs = rates = None
-    if query.other is not None:
+    if query.other:
         context.caller.require(name)
         pair = query.run, query.other, name
         runs = context.app.runs.compare_latest(*pair, start, end)
         rates = context.app.runs.rates(*pair, start, end)
     asked = {side: options.asked_options(request.query_params, f"{side}.") for side in SIDES}
     result = None
-    if query.spacecraft is not None and query.other is None:
+    if query.spacecraft is not None and not query.other:
         context.caller.require(query.spacecraft)
         a, b = (OptionsIn.model_validate(asked[side]) for side in SIDES)
         result = context.app.comparisons.of_options(
@@ -111,11 +106,10 @@ def compare_page(
         most_compared=MOST_COMPARED,
         spacecraft=context.spacecraft,
         forms={side: options.fields_of(asked[side], None, f"{side}.", mission) for side in SIDES},
-        now={} if mission is None else options.settings_of_mission(mission),
         result=result,
         trends=result and _drawn(result.cell_s, _shares(result)),
         sides=SIDES,
-        matrix=_matrix(result),
+        moved=_moved(runs and runs[0], result),
     )
 
 
@@ -141,11 +135,16 @@ def _shares(result: Comparison) -> list[dict[str, Vector]]:
     return sides
 
 
-def _matrix(result: Comparison | None) -> dict[tuple[str, str], int]:
-    """How many stars went from which outcome to which."""
+def _moved(runs: RunComparison | None, result: Comparison | None) -> list[tuple[int, str, str]]:
+    """Numbers of stars whose outcome or name differs, with both outcomes."""
+    if runs is not None:
+        moved = (each for each in runs.stars.transitions if each.is_change)
+        return [(each.stars, each.before, each.after) for each in moved]
     if result is None:
-        return {}
-    return {(each.from_, each.to): each.stars for each in result.transitions}
+        return []
+    found = [(each.stars, each.from_, each.to) for each in result.transitions]
+    changed = [each for each in found if each[1] != each[2]]
+    return [each for each in (*changed, (result.renamed, "unique", "unique")) if each[0]]
 
 
 @console_page("/runs", "Runs", Policy("read", "nothing"), position=50)

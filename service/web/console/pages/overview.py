@@ -11,27 +11,23 @@ from starlette.responses import Response
 
 from service.storage.queries.fleet import PERIODS_S, Fleet, FleetCells, FleetRow, Period
 from service.storage.recording.unsaved_result import LIVE
-from service.times import DAY_S, shifted
 from service.trends.limits import Severity
 from service.trends.measures import BatchShare, StarShare
 from service.trends.quantities import QUANTITIES, OneOf
 from service.vectors import Matrix
 from service.web.console import page
 from service.web.console.charts.sparkline import SparklineDrawing, common_top, packed, sparkline
-from service.web.console.formatting import second_after
 from service.web.requests.access import Policy
 
 STALE_AFTER_S = 3600.0
 """A spacecraft is silent, or behind the latest batch of its run, from this long on."""
-Order = Literal["worst", "name", "behind", "unique", "ambiguous", "unmatched", "alarms"]
-Shown = Literal["all", "trouble", "alarm", "stale", "good", "suspect", "no_attitude", "no_batches"]
+Order = Literal["worst", "name", "behind", "ambiguous", "unmatched", "alarms"]
+Shown = Literal["all", "trouble", "alarm", "stale", "no_attitude", "no_batches"]
 SHOWN: dict[Shown, str] = {
     "all": "all",
     "trouble": "in trouble",
     "alarm": "with an alarm",
     "stale": "silent or behind",
-    "good": "good",
-    "suspect": "suspect",
     "no_attitude": "no attitude",
     "no_batches": "no batches",
 }
@@ -139,14 +135,6 @@ class OverviewLine:
         """True if it needs a look."""
         return bool(self.faults)
 
-    @property
-    def last_day(self) -> dict[str, str]:
-        """The bounds of the day that ends with its latest batch."""
-        assert self.item.latest_batch is not None
-        # The latest batch belongs to it, and the end of a stretch does not.
-        end = second_after(self.item.latest_batch.time)
-        return {"start": shifted(end, -DAY_S).text, "end": end.text}
-
     def share(self, outcome: str) -> float:
         """The share of an outcome in the last hour; -1 where nothing was observed."""
         counts = self.item.last_hour
@@ -156,7 +144,7 @@ class OverviewLine:
 
     def is_marked(self, outcome: str) -> bool:
         """True if the share of an outcome needs attention."""
-        return outcome != "unique" and self.share(outcome) > MARKED_SHARE
+        return self.share(outcome) > MARKED_SHARE
 
 
 def _is_long(seconds: float | None) -> bool:

@@ -133,6 +133,13 @@ class ShownPeriod:
         """Its length."""
         return (self.end.tai_ns - self.start.tai_ns) / 1e9
 
+    @property
+    def address(self) -> dict[str, str]:
+        """The query parameters that name it."""
+        if self.range:
+            return {"range": self.range}
+        return {"start": self.start.text, "end": self.end.text}
+
     def moved(self, by: float, scale: float = 1.0) -> dict[str, str]:
         """The bounds of a period moved by parts of its length, longer or shorter."""
         middle_s = self.seconds * (0.5 + by)
@@ -173,7 +180,6 @@ def spacecraft_page(name: str, query: FromQuery[SpacecraftQuery], context: Conte
         retired=state.retired,
         latest=latest,
         tracking=state.tracking,
-        attitude=_attitude(context, latest),
         stretch=stretch,
         ranges=list(RANGES_S),
         by=ranking.by,
@@ -263,13 +269,6 @@ def _worst(
         if found[-1].items and found[-1].items[0].value:
             return found[-1]
     return found[0]
-
-
-def _attitude(context: PageContext, latest: list[Summary]) -> Any:
-    """The attitude of the latest batch; None where it has none, even if an earlier one has."""
-    if not latest or latest[0].status is None:
-        return None
-    return context.app.results.get(latest[0].id).answer.attitude
 
 
 def _others(context: PageContext, query: SpacecraftQuery, stretch: ShownPeriod | None) -> list[str]:

@@ -21,6 +21,23 @@ export async function attempt(button, status, work) {
   }
 }
 
+// A new element with its properties and what it holds.
+export function element(name, properties = {}, ...children) {
+  const made = Object.assign(document.createElement(name), properties);
+  made.append(...children);
+  return made;
+}
+
+// A job once it has ended; it is asked for twice a second, and told meanwhile.
+export async function ended(address, isOver, tell) {
+  for (;;) {
+    const job = await send("GET", address);
+    if (isOver(job)) return job;
+    tell(job);
+    await new Promise((resolve) => setTimeout(resolve, 500));
+  }
+}
+
 // The name of the author, stored in this browser so that it is typed once.
 export function rememberWho(field) {
   // After sign-in the author is the name of the token.

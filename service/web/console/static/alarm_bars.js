@@ -1,11 +1,11 @@
 // Bars under a chart of trends: when alarms of its quantities were out of their limits.
 
+import { element } from "./actions.js";
 import { posix, utc } from "./times.js";
 import { rooted } from "./requests.js";
 
 const SHAPES = { watch: "△", warning: "▲", critical: "◆" };
 const MOST_ROWS = 4;
-
 
 export class AlarmBars {
   constructor(holder, quantities) {
@@ -28,33 +28,24 @@ export class AlarmBars {
     }
     this.holder.hidden = rows.size === 0;
     const shown = [...rows].slice(0, MOST_ROWS).map(([name, spans]) => {
-      const row = document.createElement("div");
-      const label = document.createElement("p");
-      const track = document.createElement("div");
-      label.textContent = name;
-      track.className = "track";
-      track.append(...spans.map((each) => this.bar(each, name, start, end)));
-      row.append(label, track);
-      return row;
+      const track = element("div", { className: "track" }, ...spans.map((each) => this.bar(each, name, start, end)));
+      return element("div", {}, element("p", {}, name), track);
     });
     this.holder.replaceChildren(...shown);
   }
 
   bar({ id, severity, start: from, end: until }, name, start, end) {
-    const bar = document.createElement("a");
     const part = (text) => Math.min(1, Math.max(0, (posix(text) - start) / (end - start)));
     const left = part(from);
     const right = until === null ? 1 : part(until);
     const run = new URLSearchParams(location.search).get("run");
-    bar.href = rooted(`/alarms/${id}${run ? `?run=${encodeURIComponent(run)}` : ""}`);
-    bar.className = severity;
+    const title = `${severity}: ${name}, from ${utc(posix(from))} ${until === null ? "until now" : `to ${utc(posix(until))}`} UTC`;
+    const href = rooted(`/alarms/${id}${run ? `?run=${encodeURIComponent(run)}` : ""}`);
+    // A shape for which the bar is too narrow breaks to a line that is not seen.
+    const bar = element("a", { href, title, ariaLabel: title, className: severity }, `\u200b${SHAPES[severity]}`);
     // A short bar at the end of the chart stays within it.
     bar.style.left = `min(${100 * left}%, 100% - 6px)`;
     bar.style.width = `${100 * (right - left)}%`;
-    // A shape for which the bar is too narrow breaks to a line that is not seen.
-    bar.textContent = `\u200b${SHAPES[severity]}`;
-    bar.title = `${severity}: ${name}, from ${utc(posix(from))} ${until === null ? "until now" : `to ${utc(posix(until))}`} UTC`;
-    bar.setAttribute("aria-label", bar.title);
     return bar;
   }
 }

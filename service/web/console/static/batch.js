@@ -29,7 +29,6 @@ async function draw(where) {
     history.replaceState(null, "", where);
     outcome.replaceWith(document.adoptNode(fresh.getElementById("outcome")));
     if (focus) document.getElementById(focus)?.focus({ preventScroll: true });
-    ready();
   } catch (error) {
     if (mine !== asked) return;
     outcome.removeAttribute("aria-busy");
@@ -51,11 +50,6 @@ async function adopt(button) {
     await send("POST", "/api/v1/annotations", JSON.stringify({ text, start: time, spacecraft, who: sign.who }));
     location.href = rooted(`/batches/${adopted.id}`);
   });
-}
-
-// Shows the buttons that need scripts.
-function ready() {
-  for (const button of document.querySelectorAll("[data-copy], [data-adopt]")) button.hidden = false;
 }
 
 function point(event, on) {
@@ -91,4 +85,3 @@ document.addEventListener("click", (event) => {
 });
 document.addEventListener("mouseover", (event) => point(event, true));
 document.addEventListener("mouseout", (event) => point(event, false));
-ready();

@@ -1,5 +1,5 @@
 // Parts of every page: the theme, the choice of a run, copying, and the event stream.
-import { keepFresh } from "./live_updates.js";
+import { keepFresh, refreshSoon } from "./live_updates.js";
 import { attempt, send } from "./actions.js";
 import "./time_fields.js";
 import { rooted } from "./requests.js";
@@ -17,7 +17,6 @@ function nameTheme() {
   theme.setAttribute("aria-label", `Switch to the ${isDark() ? "light" : "dark"} theme`);
 }
 
-theme.hidden = false;
 theme.addEventListener("click", () => {
   document.documentElement.dataset.theme = isDark() ? "light" : "dark";
   localStorage.setItem("theme", document.documentElement.dataset.theme);
@@ -36,7 +35,7 @@ runs.addEventListener("change", () => runs.requestSubmit());
 
 // On a narrow screen the content stands before the filter.
 if (matchMedia("(max-width: 720px)").matches) {
-  for (const each of document.querySelectorAll(".filter")) each.open = each.querySelector("[aria-invalid]") !== null;
+  for (const each of document.querySelectorAll(".filter:not([data-open])")) each.open = each.querySelector("[aria-invalid]") !== null;
 }
 
 // The range is chosen by the menu alone; the charts of a spacecraft are drawn without loading the page anew.
@@ -99,9 +98,6 @@ sound.addEventListener("click", () => {
 });
 document.addEventListener("critical", () => localStorage.getItem("sound") === "on" && ring());
 
-const copies = () => document.querySelectorAll("button[data-copy]").forEach((each) => (each.hidden = false));
-copies();
-document.addEventListener("drawn", copies);
 document.addEventListener("click", async (event) => {
   const button = event.target.closest("[data-copy]");
   if (!button) return;
@@ -115,6 +111,18 @@ document.addEventListener("click", async (event) => {
     getSelection().selectAllChildren(source);
     button.textContent = "Marked: press Ctrl-C";
   }
+});
+
+// A button with all of its request: `data-send` is method and address, `data-done` what is said then.
+document.addEventListener("click", ({ target }) => {
+  const button = target.closest("[data-send]");
+  if (!button) return;
+  const { send: asked, body, done } = button.dataset;
+  attempt(button, document.getElementById("message"), async () => {
+    await send(...asked.split(" "), body);
+    refreshSoon();
+    return done;
+  });
 });
 
 document.getElementById("sign-out")?.addEventListener("click", (event) => {

@@ -5,6 +5,7 @@
 // connections to a server, and catches up when it is visible again.
 import { fetchLatest, swapRegions } from "./regions.js";
 import { rooted } from "./requests.js";
+import { utc } from "./times.js";
 
 const EVENT_KINDS = [
   "batches",
@@ -34,10 +35,6 @@ let retry = null;
 let refused = false;
 let stale = false;
 let drawEveryMs = DRAW_EVERY_MS;
-
-function clock(moment) {
-  return moment.toISOString().slice(0, 19).replace("T", " ");
-}
 
 function showState(state, text) {
   shown.className = "";
@@ -144,7 +141,7 @@ const isIdle = () => document.hidden && localStorage.getItem("sound") !== "on";
 async function interrupted() {
   // Streams end now and then by design, and the next attempt succeeds: that is not shown.
   if (lostAt === null) {
-    lostAt = new Date();
+    lostAt = Date.now();
     setTimeout(showLost, SHOW_LOST_AFTER_MS);
   }
   // A browser gives up a stream that was answered with a status other than 200.
@@ -184,19 +181,19 @@ function scheduleRetry(waitMs) {
     retry = null;
     if (source === null && !isIdle()) connect();
   }, waitMs);
-  if (lostAt !== null && new Date() - lostAt > SHOW_LOST_AFTER_MS) showLost();
+  if (lostAt !== null && Date.now() - lostAt > SHOW_LOST_AFTER_MS) showLost();
 }
 
 function stop(status) {
   refused = true;
   lostAt = null;
   const reason = status === 401 ? "The session has ended: sign in again" : "This token may not read the events";
-  showState("lost", `▲ Not connected. ${reason}; the page shows the state of ${clock(new Date())} UTC`);
+  showState("lost", `▲ Not connected. ${reason}; the page shows the state of ${utc(Date.now() / 1000)} UTC`);
 }
 
 function showLost() {
   if (lostAt === null) return;
-  showState("lost", `▲ Connection lost since ${clock(lostAt)} UTC; trying again. The page shows the previous state`);
+  showState("lost", `▲ Connection lost since ${utc(lostAt / 1000)} UTC; trying again. The page shows the previous state`);
 }
 
 export function keepFresh() {

@@ -1,26 +1,15 @@
 // The overview: filter and order its rows without loading the page anew, and the heat map.
 import { HeatMap } from "./heat_map.js";
-import { fetchLatest, swapRegions } from "./regions.js";
+import { withoutReload } from "./regions.js";
 import { rooted } from "./requests.js";
 
 const TYPING_MS = 200;
 const heat = new HeatMap(document.getElementById("heat"));
+const go = withoutReload((text) => heat.say(text));
 
 function show() {
   const cells = document.querySelector("#overview template[data-json]");
   heat.show(cells && JSON.parse(cells.content.textContent));
-}
-
-async function go(address, push) {
-  history[push ? "pushState" : "replaceState"](null, "", address);
-  try {
-    const fresh = await fetchLatest(location.href);
-    if (fresh === null) return;
-    swapRegions(fresh);
-    document.dispatchEvent(new CustomEvent("drawn"));
-  } catch (error) {
-    heat.say(`Not shown: ${error.message}`);
-  }
 }
 
 // The present address with the fields of the filter; other parameters stay.
@@ -39,21 +28,14 @@ document.addEventListener("input", (event) => {
   const form = event.target.closest("#filter");
   if (!form) return;
   clearTimeout(typing);
-  typing = setTimeout(() => go(asked(form), false), event.target.matches("select") ? 0 : TYPING_MS);
+  typing = setTimeout(() => go(asked(form), "replaceState"), event.target.matches("select") ? 0 : TYPING_MS);
 });
 document.addEventListener("submit", (event) => {
   if (event.target.id !== "filter") return;
   event.preventDefault();
   clearTimeout(typing);
-  go(asked(event.target), false);
+  go(asked(event.target), "replaceState");
 });
-document.addEventListener("click", (event) => {
-  const link = event.target.closest("a[data-go]");
-  if (!link || event.ctrlKey || event.metaKey || event.shiftKey) return;
-  event.preventDefault();
-  go(link.href, true);
-});
-addEventListener("popstate", () => go(location.href, false));
 document.addEventListener("drawn", show);
 document.addEventListener("theme", show);
 addEventListener("resize", show);

@@ -1,11 +1,11 @@
 // Solves a picture without recording it, shows what was found, and records it where that is asked.
-import { attempt } from "./actions.js";
+import { attempt, element } from "./actions.js";
 import { parsed, rooted, unexpected } from "./requests.js";
 
 const MOST_ROWS = 30;
-const element = (id) => document.getElementById(id);
-const form = element("picture");
-const file = element("file");
+const byId = (id) => document.getElementById(id);
+const form = byId("picture");
+const file = byId("file");
 let solved = null;
 let asked = 0;
 
@@ -30,37 +30,30 @@ function upload(address, body) {
 }
 
 function show(share, text) {
-  const progress = element("progress");
+  const progress = byId("progress");
   progress.hidden = text === "";
   if (share === null) progress.removeAttribute("value");
   else progress.value = share;
-  element("picture-status").textContent = text;
+  byId("picture-status").textContent = text;
 }
 
 // The advice comes with a word of its kind before the colon.
 const inWords = (remark) => remark.replace(/^(\w+): /, (_, word) => `${word.replaceAll("_", " ")}: `);
 
 function items(list, texts) {
-  element(list).replaceChildren(...texts.map((text) => Object.assign(document.createElement("li"), { textContent: inWords(text) })));
+  byId(list).replaceChildren(...texts.map((text) => element("li", {}, inWords(text))));
 }
 
-function row(cells) {
-  const line = document.createElement("tr");
-  for (const [index, [name, text]] of cells.entries()) {
-    const cell = document.createElement(index ? "td" : "th");
-    if (index) Object.assign(cell, { className: "number" }).dataset.name = name;
-    else cell.scope = "row";
-    cell.textContent = text;
-    line.append(cell);
-  }
-  return line;
+function row([[, first], ...others]) {
+  const cells = others.map(([name, text]) => {
+    const cell = element("td", { className: "number" }, text);
+    cell.dataset.name = name;
+    return cell;
+  });
+  return element("tr", {}, element("th", { scope: "row" }, first), ...cells);
 }
 
-function fact([name, text]) {
-  const line = document.createElement("div");
-  line.append(Object.assign(document.createElement("dt"), { textContent: name }), Object.assign(document.createElement("dd"), { textContent: text }));
-  return line;
-}
+const fact = ([name, text]) => element("div", {}, element("dt", {}, name), element("dd", {}, text));
 
 const within = (sigma, unit) => (sigma === null ? "" : ` ± ${sigma}${unit}`);
 
@@ -93,31 +86,31 @@ function address(bytes, kind) {
 
 function draw(name, picture) {
   const { overlay_png: overlay, ...numbers } = picture;
-  for (const link of ["save", "save-json"]) URL.revokeObjectURL(element(link).href);
+  for (const link of ["save", "save-json"]) URL.revokeObjectURL(byId(link).href);
   const image = address(Uint8Array.from(atob(overlay), (each) => each.charCodeAt(0)), "image/png");
   const stars = picture.stars.length;
-  Object.assign(element("drawn"), { src: image, alt: `${name} with ${stars} identified stars among ${picture.candidates} points of light; the table lists the brightest` });
-  Object.assign(element("full"), { href: image, download: `${name}-stars.png` });
-  Object.assign(element("save"), { href: image, download: `${name}-stars.png` });
-  Object.assign(element("save-json"), { href: address(JSON.stringify(numbers), "application/json"), download: `${name}-stars.json` });
-  element("found").hidden = false;
-  element("failed").hidden = picture.attitude !== null;
-  element("numbers").hidden = picture.attitude === null;
+  Object.assign(byId("drawn"), { src: image, alt: `${name} with ${stars} identified stars among ${picture.candidates} points of light; the table lists the brightest` });
+  Object.assign(byId("full"), { href: image, download: `${name}-stars.png` });
+  Object.assign(byId("save"), { href: image, download: `${name}-stars.png` });
+  Object.assign(byId("save-json"), { href: address(JSON.stringify(numbers), "application/json"), download: `${name}-stars.json` });
+  byId("found").hidden = false;
+  byId("failed").hidden = picture.attitude !== null;
+  byId("numbers").hidden = picture.attitude === null;
   if (picture.attitude === null) {
     items("advice", picture.remarks);
-    element("hint-field").hidden = Boolean(element("field").value || element("camera").value);
+    byId("hint-field").hidden = Boolean(byId("field").value || byId("camera").value);
     return `No attitude; ${picture.candidates} points of light.`;
   }
   const shown = picture.stars.slice(0, MOST_ROWS);
-  element("star-rows").replaceChildren(...shown.map((star) => row([
+  byId("star-rows").replaceChildren(...shown.map((star) => row([
     ["star", star.name ? `${star.name} (${star.id})` : star.id],
     ["V, mag", star.v_mag.toFixed(2)],
     ["right, px", star.u_px.toFixed(1)],
     ["down, px", star.v_px.toFixed(1)],
     ["residual, px", Math.hypot(...star.residual_px).toFixed(2)],
   ])));
-  element("more-stars").textContent = stars > MOST_ROWS ? `The ${MOST_ROWS} brightest of ${stars}; the JSON has all.` : "";
-  element("facts").replaceChildren(...facts(picture).map(fact));
+  byId("more-stars").textContent = stars > MOST_ROWS ? `The ${MOST_ROWS} brightest of ${stars}; the JSON has all.` : "";
+  byId("facts").replaceChildren(...facts(picture).map(fact));
   items("remarks", picture.remarks);
   return `${stars} stars identified, ${picture.candidates} points of light.`;
 }
@@ -126,13 +119,13 @@ async function solve() {
   const mine = ++asked;
   const chosen = file.files[0];
   const query = new URLSearchParams({ overlay: "true" });
-  if (element("camera").value) query.set("spacecraft", element("camera").value);
-  if (element("field").value) query.set("field_of_view_deg", element("field").value);
-  if (element("image").value.trim()) query.set("image", element("image").value.trim());
+  if (byId("camera").value) query.set("spacecraft", byId("camera").value);
+  if (byId("field").value) query.set("field_of_view_deg", byId("field").value);
+  if (byId("image").value.trim()) query.set("image", byId("image").value.trim());
   const button = form.querySelector("button.main");
   button.disabled = true;
-  for (const part of ["found", "failed", "record"]) if (element(part)) element(part).hidden = true;
-  element("picture-status").className = "";
+  for (const part of ["found", "failed", "record"]) if (byId(part)) byId(part).hidden = true;
+  byId("picture-status").className = "";
   show(0, "Sending…");
   let text = "";
   let isRefused = false;
@@ -150,31 +143,31 @@ async function solve() {
     if (mine === asked) button.disabled = false;
   }
   show(0, "");
-  element("picture-status").className = isRefused ? "problem" : "";
-  element("picture-status").textContent = text;
+  byId("picture-status").className = isRefused ? "problem" : "";
+  byId("picture-status").textContent = text;
 }
 
 function offerRecord(picture) {
-  if (!element("record")) return;
-  element("record").hidden = false;
-  if (element("camera").value) element("record-camera").value = element("camera").value;
-  element("record-time").value = picture.time ?? "";
-  element("record-status").textContent = "";
+  if (!byId("record")) return;
+  byId("record").hidden = false;
+  if (byId("camera").value) byId("record-camera").value = byId("camera").value;
+  byId("record-time").value = picture.time ?? "";
+  byId("record-status").textContent = "";
 }
 
 form.addEventListener("submit", (event) => {
   event.preventDefault();
   solve();
 });
-element("record-form")?.addEventListener("submit", (event) => {
+byId("record-form")?.addEventListener("submit", (event) => {
   event.preventDefault();
-  attempt(event.target.querySelector("button"), element("record-status"), async () => {
+  attempt(event.target.querySelector("button"), byId("record-status"), async () => {
     const query = new URLSearchParams();
-    if (element("image").value.trim()) query.set("image", element("image").value.trim());
+    if (byId("image").value.trim()) query.set("image", byId("image").value.trim());
     for (const name of ["time", "batch"]) {
-      if (element(`record-${name}`).value) query.set(name, element(`record-${name}`).value);
+      if (byId(`record-${name}`).value) query.set(name, byId(`record-${name}`).value);
     }
-    const name = encodeURIComponent(element("record-camera").value);
+    const name = encodeURIComponent(byId("record-camera").value);
     const answer = await upload(`/api/v1/spacecraft/${name}/frames?${query}`, solved).finally(() => show(0, ""));
     location.href = rooted(`/batches/${answer.id}`);
   });

@@ -28,6 +28,30 @@ export async function fetchLatest(address) {
   }
 }
 
+// Lets links with `data-go`, and the browser's history, replace the regions of the page; returns
+// what shows an address, which the history gets by its method `how`.
+export function withoutReload(tell) {
+  async function go(address, how = "pushState") {
+    if (how) history[how](null, "", address);
+    try {
+      const fresh = await fetchLatest(location.href);
+      if (fresh === null) return;
+      swapRegions(fresh);
+      document.dispatchEvent(new CustomEvent("drawn"));
+    } catch (error) {
+      tell(`Not shown: ${error.message}`);
+    }
+  }
+  document.addEventListener("click", (event) => {
+    const link = event.target.closest("a[data-go]");
+    if (!link || event.ctrlKey || event.metaKey || event.shiftKey) return;
+    event.preventDefault();
+    go(link.href);
+  });
+  addEventListener("popstate", () => go(location.href, null));
+  return go;
+}
+
 // A region with typed input or selected text is not replaced.
 function isBusy(region) {
   const active = document.activeElement;

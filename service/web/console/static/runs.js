@@ -1,4 +1,4 @@
-// Starts a replay, and switches the alarms of a run.
+// Starts a replay.
 import { refreshSoon } from "./live_updates.js";
 import { attempt, send } from "./actions.js";
 
@@ -16,16 +16,5 @@ document.getElementById("replay").addEventListener("submit", (event) => {
     const replay = await send("POST", `/api/v1/replays?${query}`, file.files[0], headers);
     refreshSoon();
     return `Replaying ${file.files[0].name} into run ${replay.run}.`;
-  });
-});
-
-document.addEventListener("click", (event) => {
-  const button = event.target.closest("[data-watch]");
-  if (!button) return;
-  attempt(button, message, async () => {
-    const alarms = button.dataset.alarms === "true";
-    await send("PUT", `/api/v1/runs/${encodeURIComponent(button.dataset.watch)}`, JSON.stringify({ alarms }));
-    refreshSoon();
-    return `Alarms of run ${button.dataset.watch} are ${alarms ? "on" : "off"}.`;
   });
 });

@@ -1,11 +1,5 @@
 // Asks for name and reason before something is adopted, and says what that will change.
-import { rememberWho } from "./actions.js";
-
-function element(name, properties = {}, ...children) {
-  const made = Object.assign(document.createElement(name), properties);
-  made.append(...children);
-  return made;
-}
+import { element, rememberWho } from "./actions.js";
 
 // Resolves to { who, comment }, or to null if the reader changed their mind.
 export function signed(title, changes, action) {

@@ -1,7 +1,8 @@
 // The trends of one spacecraft: charts of the period in the address.
+import { attempt, element } from "./actions.js";
 import { annotationsShown } from "./annotations.js";
 import { requestJson, rooted } from "./requests.js";
-import { fetchLatest, swapRegions } from "./regions.js";
+import { fetchPage, withoutReload } from "./regions.js";
 import { AlarmBars } from "./alarm_bars.js";
 import { posix, utc } from "./times.js";
 import { Trend } from "./trend.js";
@@ -10,6 +11,10 @@ const stretch = () => document.getElementById("stretch");
 const status = document.getElementById("charts-status");
 
 const LINES = [{ tone: "--curve" }, { tone: "--soft", dash: [5, 4] }];
+
+const menu = document.getElementById("other-chart");
+const narrow = matchMedia("(max-width: 720px)").matches;
+if (menu) menu.value = localStorage.getItem("other-chart") ?? (narrow ? "batches" : "");
 
 let trends = [];
 let asked = 0;
@@ -38,7 +43,7 @@ async function draw() {
     if (mine !== asked) return;
     if (before) Object.assign(beside.at(-1), { unix_s: beside.at(-1).unix_s.map((each) => each + Number(shift)), shift: Number(shift) });
     shown = found;
-    for (const trend of trends) {
+    for (const trend of trends.filter((each) => isShown(each, found))) {
       trend.vertical = y ?? "robust";
       trend.show(shown, posix(start), posix(end), annotationsShown(), beside);
       trend.definition.bars.show(JSON.parse(alarms), posix(start), posix(end));
@@ -47,24 +52,40 @@ async function draw() {
     document.getElementById("charts").dataset.drawn = String(found.unix_s.length);
   } catch (error) {
     if (mine !== asked) return;
-    status.className = "problem";
-    status.textContent = `The trends could not be read: ${error.message}. The page shows the previous ones.`;
+    tellFault(`The trends could not be read: ${error.message}. The page shows the previous ones.`);
   }
 }
 
-async function go(address, push = true) {
-  if (push) history.pushState(null, "", address);
-  try {
-    const fresh = await fetchLatest(address);
-    if (fresh === null) return;
-    swapRegions(fresh);
-  } catch (error) {
-    status.className = "problem";
-    status.textContent = `Not shown: ${error.message}`;
-    return;
-  }
-  await draw();
+// Of the other charts one without a value is not drawn, nor one that the menu leaves out.
+function isShown(trend, history) {
+  const section = trend.holder.closest("#other-charts > section");
+  if (!section) return true;
+  const { chart } = trend.holder.dataset;
+  const option = menu.querySelector(`[value="${chart}"]`);
+  option.hidden = !trend.valued(history).length;
+  section.hidden = option.hidden || ![chart, ""].includes(menu.value);
+  return !section.hidden;
 }
+
+// A part of another page, below the link to it.
+async function showPart(event) {
+  const link = event.target.closest("[data-part]");
+  if (!link || event.ctrlKey || event.metaKey) return;
+  event.preventDefault();
+  attempt(null, status, async () => {
+    const fresh = await fetchPage(link.href);
+    const part = fresh.getElementById(link.dataset.part);
+    if (part === null) return "There are no batches in this period.";
+    document.getElementById(part.id).replaceWith(document.adoptNode(part));
+  });
+}
+
+function tellFault(text) {
+  status.className = "problem";
+  status.textContent = text;
+}
+
+const go = withoutReload(tellFault);
 
 function zoom(bounds) {
   if (bounds === null) {
@@ -83,22 +104,18 @@ function zoom(bounds) {
 
 // The batches about a point of a chart.
 function linkTo({ start, end }) {
-  const link = document.createElement("a");
   const query = new URLSearchParams({ run: document.body.dataset.run, spacecraft: document.getElementById("charts").dataset.spacecraft, start: asText(start), end: asText(end) });
-  link.href = rooted(`/batches?${query}`);
-  link.textContent = `Batches from ${utc(start)} to ${utc(end)} UTC`;
   status.className = "";
-  status.replaceChildren(link);
+  status.replaceChildren(element("a", { href: rooted(`/batches?${query}`) }, `Batches from ${utc(start)} to ${utc(end)} UTC`));
 }
 
 if (stretch()) {
   make();
   draw();
-  document.addEventListener("click", (event) => {
-    const link = event.target.closest("[data-go]");
-    if (!link || event.ctrlKey || event.metaKey) return;
-    event.preventDefault();
-    go(link.href);
+  document.addEventListener("click", showPart);
+  menu?.addEventListener("change", () => {
+    localStorage.setItem("other-chart", menu.value);
+    draw();
   });
   document.addEventListener("keydown", (event) => {
     if (!event.target.matches?.("[data-chart]")) return;
@@ -119,7 +136,6 @@ if (stretch()) {
     go(`${event.target.action}?${new URLSearchParams(new FormData(event.target))}`);
   });
   document.addEventListener("moment", ({ detail }) => linkTo(detail));
-  addEventListener("popstate", () => go(location.href, false));
   document.addEventListener("drawn", draw);
   document.addEventListener("theme", () => shown && draw());
 } else {

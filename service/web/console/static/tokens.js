@@ -1,21 +1,9 @@
-// Makes and revokes tokens.
+// Makes tokens.
 import { attempt, send } from "./actions.js";
 import { refreshSoon } from "./live_updates.js";
 
-const HERE = "/api/v1/tokens";
 const message = document.getElementById("message");
 const shown = document.getElementById("token-shown");
-
-document.addEventListener("click", (event) => {
-  const button = event.target.closest("[data-revoke]");
-  if (!button) return;
-  const { token } = button.closest("[data-token]").dataset;
-  attempt(button, message, async () => {
-    await send("DELETE", `${HERE}/${encodeURIComponent(token)}`);
-    refreshSoon();
-    return `Revoked: ${token}.`;
-  });
-});
 
 document.getElementById("new-token").addEventListener("submit", (event) => {
   event.preventDefault();
@@ -28,7 +16,7 @@ document.getElementById("new-token").addEventListener("submit", (event) => {
       spacecraft: spacecraft.value ? [spacecraft.value] : null,
       days: Number(days.value),
     };
-    const { token } = await send("POST", HERE, JSON.stringify(settings));
+    const { token } = await send("POST", "/api/v1/tokens", JSON.stringify(settings));
     document.getElementById("token").textContent = token;
     shown.hidden = false;
     event.target.reset();

@@ -1,5 +1,6 @@
 // One chart of trends: a line for each quantity's mean, a band from least to greatest, its limits.
 
+import { element } from "./actions.js";
 import { DAY_S, dayOfYear, twoDigits, utc } from "./times.js";
 
 const DASHES = { watch: [2, 4], warning: [6, 4], critical: [] };
@@ -228,25 +229,24 @@ export class Trend {
     return { width: this.holder.clientWidth, height: this.holder.clientHeight };
   }
 
+  // The quantities of which a history has values.
+  valued({ series }) {
+    return this.definition.quantities.filter((each) => series[each.name]?.mean.some((value) => value !== null));
+  }
+
   // `others` are histories of further spacecraft, of which the first quantity is drawn.
   show(history, start, end, annotations = [], others = []) {
     this.history = history;
     this.others = others;
     this.annotations = annotations;
     this.bounds = [start, end];
-    const { quantities } = this.definition;
-    const known = quantities.filter((each) => history.series[each.name]?.mean.some((value) => value !== null));
+    const known = this.valued(history);
     this.chart?.destroy();
     this.chart = null;
     this.holder.replaceChildren();
-    // A chart without a value is not drawn, but for the first one of the page.
-    const section = this.holder.closest("section");
-    section.hidden = !known.length && section.closest("details") !== null;
     if (!known.length) {
-      const note = document.createElement("p");
-      note.className = "chart-note";
-      note.textContent = history.unix_s.length ? "No batch here has a value of this quantity." : "No batches in this period.";
-      this.holder.append(note);
+      const note = history.unix_s.length ? "No batch here has a value of this quantity." : "No batches in this period.";
+      this.holder.append(element("p", { className: "chart-note" }, note));
       this.readout.textContent = "\u00a0";
       return;
     }
@@ -376,8 +376,7 @@ export class Trend {
     });
     const { min: least, max: most } = chart.scales.y;
     const beyond = this.data[0].filter((_, index) => this.known.some((__, k) => this.data[3 * k + 3][index] > most || (this.data[3 * k + 2][index] !== null && this.data[3 * k + 2][index] < least))).length;
-    const names = this.known.length > 1 ? [] : this.known.map(({ label }) => label);
-    this.legend = [...names, ...(beyond ? [`▲ at the edge: ${beyond} beyond it`] : [])].join("; ") || "\u00a0";
+    this.legend = beyond ? `▲ at the edge: ${beyond} beyond it` : "\u00a0";
     this.readout.textContent = this.legend;
     this.drawKeys();
     const marked = this.annotations.length ? `; ${this.definition.marks ?? "annotations"}: ${this.annotations.length}, listed below` : "";
@@ -390,13 +389,8 @@ export class Trend {
     keys.className = "chart-keys range";
     const buttons = this.known.length > 1 ? this.known.map(({ name, label, dash }) => this.key(name, `${dash ? "╌" : "━"} ${label}`)) : [];
     const names = this.others.map(({ spacecraft, shift }, k) => {
-      const key = document.createElement("span");
-      const mark = document.createElement("span");
-      mark.textContent = "━ ";
-      mark.className = shift ? "soft" : TONES[k % TONES.length].slice(2);
-      mark.ariaHidden = "true";
-      key.append(mark, `${spacecraft}: ${this.known[0].label}${shift ? `, ${shift / DAY_S} d before` : ""}`);
-      return key;
+      const mark = element("span", { className: shift ? "soft" : TONES[k % TONES.length].slice(2), ariaHidden: "true" }, "━ ");
+      return element("span", {}, mark, `${spacecraft}: ${this.known[0].label}${shift ? `, ${shift / DAY_S} d before` : ""}`);
     });
     keys.replaceChildren(...buttons, ...names);
     keys.hidden = !keys.childElementCount;
@@ -407,10 +401,7 @@ export class Trend {
   }
 
   key(name, label) {
-    const button = document.createElement("button");
-    button.type = "button";
-    button.textContent = label;
-    button.ariaPressed = String(!this.hidden.has(name));
+    const button = element("button", { type: "button", ariaPressed: String(!this.hidden.has(name)) }, label);
     button.addEventListener("click", () => {
       this.hidden.has(name) ? this.hidden.delete(name) : this.hidden.add(name);
       this.show(this.history, ...this.bounds, this.annotations, this.others);
