@@ -23,6 +23,8 @@ OUTLIER_SIGMAS = 4.0
 OBSERVABLE = 0.5
 """The share of its prior's sigma below which a parameter counts as seen in the pictures."""
 LEAST_FLOOR_PX = 0.01
+LEAST_TOLD_PX = 0.05
+"""Least predicted error of a place: bright stars would decide over the whole lens otherwise."""
 
 
 @dataclass(frozen=True)
@@ -150,7 +152,8 @@ def _told_sigma(result: PictureResult) -> Vector:
     points = result.points
     places = zip(points.u_px.tolist(), points.v_px.tolist(), strict=True)
     sigma = dict(zip(places, points.sigma_px.tolist(), strict=True))
-    return np.array([sigma[each.u_px, each.v_px] for each in result.attitude.stars])
+    told = [sigma[each.u_px, each.v_px] for each in result.attitude.stars]
+    return np.maximum(told, LEAST_TOLD_PX)
 
 
 def _keep(view: _View, good: Vector) -> None:

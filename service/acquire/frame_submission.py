@@ -204,8 +204,8 @@ def _record(
             {
                 "u_px": round(float(points.u_px[k]), 4),
                 "v_px": round(float(points.v_px[k]), 4),
-                "sigma_u_px": round(float(points.sigma_px[k]), 5),
-                "sigma_v_px": round(float(points.sigma_px[k]), 5),
+                "sigma_u_px": round(math.sqrt(points.covariance_px2[k, 0, 0]), 5),
+                "sigma_v_px": round(math.sqrt(points.covariance_px2[k, 1, 1]), 5),
                 "flux_counts": rounded_counts(float(points.flux_counts[k]), 1),
                 "magnitude": star["magnitude"],
                 "signal_ratio": round(float(points.signal_ratio[k]), 1),

@@ -110,14 +110,12 @@ class TrailPlaces:
     unexplained: Array
 
     @property
-    def sigma_px(self) -> Array:
-        """One standard deviation (n,) per axis of trailed stars' places: root of the mean variance.
+    def covariance_px2(self) -> Array:
+        """The covariance (n, 2, 2) of trailed stars' places along u and v.
 
-        Light that the image does not explain, such as another trail that crosses, enlarges the
-        sigma.
+        Light that the image does not explain, such as another trail that crosses, enlarges it.
         """
-        variance = 0.5 * (self.covariance[:, 0, 0] + self.covariance[:, 1, 1])
-        return np.asarray(np.sqrt(variance * np.maximum(self.chi_square, 1.0)))
+        return self.covariance[:, :2, :2] * np.maximum(self.chi_square, 1.0)[:, None, None]
 
 
 @dataclass(frozen=True)

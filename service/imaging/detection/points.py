@@ -7,6 +7,7 @@ local noise of the filtered picture.
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -26,7 +27,7 @@ from service.imaging.detection.trails import (
     twin_distance_px,
 )
 from service.imaging.frames.frame import CountArray, Frame, bad_frame
-from service.vectors import Vector, read_only
+from service.vectors import Matrix, Vector, read_only
 
 MESH_PX = 32
 GUESSED_PSF_PX = 1.2
@@ -59,7 +60,8 @@ surroundings take 5 % off the signal to noise.
 """
 TRAIL_PEAKS, TRAIL_WEIGHT_PX, TRAIL_ROUNDS = 30, 3.0, 2
 """Number of the clearest peaks, width of the weight, and centroid rounds, used to detect trails."""
-_LEAST_SIGMA_PX = 0.05
+_LEAST_SIGMA_PX = 0.01
+"""Least standard deviation of a place: the pixels of a sensor are no more even than that."""
 _CENTROID_ROUNDS = 6
 
 
@@ -68,14 +70,15 @@ class PointSources:
     """Candidates for stars (n) in a picture, the clearest first, and the background-subtracted
     picture.
 
-    Places and sigmas are in pixels of the picture, the centre of its first being (0, 0).
+    Places are in pixels of the picture, the centre of its first being (0, 0);
+    `covariance_px2` (n, 2, 2) is that of each place along u and v.
     `signal_ratio` is the ratio of the filtered light to the local noise. `light` is the picture
     above its background, binned by `binning` a side.
     """
 
     u_px: Vector
     v_px: Vector
-    sigma_px: Vector
+    covariance_px2: Matrix
     signal_ratio: Vector
     flux_counts: Vector
     psf_sigma_px: float
@@ -96,6 +99,11 @@ class PointSources:
     trailed: str | None = None
     """The reason why places at mid exposure cannot be told for trailing stars; None if they can."""
 
+    @cached_property
+    def sigma_px(self) -> Vector:
+        """One standard deviation (n,) per axis: the root of the mean of both variances."""
+        return read_only(np.sqrt(0.5 * np.trace(self.covariance_px2, axis1=1, axis2=2)))
+
     @property
     def count(self) -> int:
         """The number of candidates."""
@@ -103,11 +111,12 @@ class PointSources:
 
     def mirrored(self, by_rows: bool) -> "PointSources":
         """The candidates on the picture with its rows, or else its columns, in reverse order."""
+        covariance = read_only(self.covariance_px2 * np.array([[1.0, -1.0], [-1.0, 1.0]]))
         if by_rows:
             v_px = read_only(self.height_px - 1 - self.v_px)
-            return replace(self, v_px=v_px, light=self.light[::-1])
+            return replace(self, v_px=v_px, covariance_px2=covariance, light=self.light[::-1])
         u_px = read_only(self.width_px - 1 - self.u_px)
-        return replace(self, u_px=u_px, light=self.light[:, ::-1])
+        return replace(self, u_px=u_px, covariance_px2=covariance, light=self.light[:, ::-1])
 
 
 def find_points(
@@ -156,7 +165,7 @@ def find_points(
     found = PointSources(
         u_px=read_only(places.u_px * binning + offset),
         v_px=read_only(places.v_px * binning + offset),
-        sigma_px=read_only(places.sigma_px * binning),
+        covariance_px2=read_only(places.covariance_px2 * binning**2),
         signal_ratio=read_only(places.signal_ratio),
         flux_counts=read_only(places.flux_counts * binning**2 * unit),
         psf_sigma_px=psf * binning,
@@ -180,11 +189,11 @@ def find_points(
 
 @dataclass(frozen=True)
 class _Places:
-    """Measured places with sigmas (n) in working pixels, signal to noise, and light in counts."""
+    """Measured places (n) with covariances in working pixels, signal to noise, and light."""
 
     u_px: Vector
     v_px: Vector
-    sigma_px: Vector
+    covariance_px2: Matrix
     signal_ratio: Vector
     flux_counts: Vector
 
@@ -204,13 +213,21 @@ def _still_places(
     # The filter may respond between two dark pixels, where there is no light.
     lit = shapes.weighted > 0.0
     ratio = ratio[lit]
+    # A star between pixels is clearer than the pixel beside it shows.
+    off_px2 = np.minimum((shapes.u_px - u)[lit] ** 2 + (shapes.v_px - v)[lit] ** 2, 0.5)
+    own_ratio = np.maximum(ratio, 1.0) * np.exp(0.25 * off_px2 / psf**2)
     return _Places(
         shapes.u_px[lit],
         shapes.v_px[lit],
-        np.maximum(PLACE_NOISE * psf / np.maximum(ratio, 1.0), _LEAST_SIGMA_PX),
+        _alike(PLACE_NOISE * psf / own_ratio),
         ratio,
         shapes.weighted[lit] * (1.0 + (psf / weight) ** 2),
     )
+
+
+def _alike(sigma_px: Vector) -> Matrix:
+    """Covariances (n, 2, 2) of places whose errors (n) are alike along both axes."""
+    return np.maximum(sigma_px, _LEAST_SIGMA_PX)[:, None, None] ** 2 * np.eye(2)
 
 
 def _behind(discs: ClippedStars, places: _Places, noise_counts: float) -> _Places:
@@ -223,7 +240,7 @@ def _behind(discs: ClippedStars, places: _Places, noise_counts: float) -> _Place
     return _Places(
         joined(discs.u_px, places.u_px),
         joined(discs.v_px, places.v_px),
-        joined(discs.sigma_px, places.sigma_px),
+        joined(_alike(discs.sigma_px), places.covariance_px2),
         joined(discs.light / noise, places.signal_ratio),
         joined(discs.light, places.flux_counts),
     )
@@ -261,7 +278,7 @@ def _middles_of_trails(
     return _Places(
         placed.u_px[alike],
         placed.v_px[alike],
-        np.maximum(placed.sigma_px[alike], _LEAST_SIGMA_PX),
+        placed.covariance_px2[alike] + _LEAST_SIGMA_PX**2 * np.eye(2),
         ratio[alike],
         placed.flux_counts[alike],
     )
