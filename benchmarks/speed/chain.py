@@ -1,4 +1,4 @@
-"""What the chain of the record costs: processor time of a post, and bytes of a batch.
+"""Cost of the record's hash chain: processor time of a post, and bytes of a batch.
 
     python -m benchmarks chain
 

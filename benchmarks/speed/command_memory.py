@@ -1,4 +1,4 @@
-"""Runs a command of the service, and prints the seconds and the most memory in MB that it took.
+"""Runs a command of the service, and prints its seconds and its greatest memory in MB.
 
 python -m benchmarks.speed.command_memory export batches --spacecraft XTE --output xte.csv
 """

@@ -1,4 +1,4 @@
-"""The first posts to a fresh server: how long the slowest of them takes, and what it needed.
+"""First posts to a fresh server: durations of the slowest ones, and their searches.
 
     python -m benchmarks first_posts
 

@@ -1,4 +1,4 @@
-"""What a batch costs: zones cold and cached, identification and solution, with checked answers.
+"""Cost of a batch: cold and cached zones, identification and solution, with checked answers.
 
 Times move with the machine, so each is shown as a ratio within this run as
 well: to the call of a compiled function that does nothing with the same

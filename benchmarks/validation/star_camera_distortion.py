@@ -210,7 +210,7 @@ def write(text: str, steps: list[Step]) -> None:
 
 
 def main() -> int:
-    """Measure, print, and write the page if asked to; 1 where a figure is out of bounds."""
+    """Command that measures, prints, and writes the page on request; 1 if out of bounds."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -71,7 +71,7 @@ def from_j2000(frame: int, records: Floats) -> Floats:
 
 
 def main() -> None:
-    """Read the kernel given as argument and write its records and intervals."""
+    """Read a C-kernel named on the command line; write its records and intervals to a folder."""
     out, most, ck, *kernels = sys.argv[1:]
     for each in (*kernels, ck):
         spice.furnsh(each)

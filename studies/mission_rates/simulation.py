@@ -255,7 +255,7 @@ assert {each.name for each in fields(Errors)} == set(LIMITS)
 
 CACHE_BYTES = 64 << 20
 LEAST_SIGMA_MAG = 1e-9
-"""Sigma of magnitude used for zero error, so that the bound can be divided by it."""
+"""Magnitude sigma that replaces zero, since the bound is divided by it."""
 OUTCOMES = {
     "unique_right": tally.CORRECT,
     "ambiguous": tally.AMBIGUOUS,

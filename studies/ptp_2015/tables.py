@@ -74,7 +74,7 @@ class Measurements:
 
     @property
     def drawn(self) -> PlottedSeries:
-        """Data of the figures, for the plots."""
+        """Measured series and tallies by figure of the paper, for the plots."""
         figures: PlottedSeries = {} if self.stars is None else {"figure-10": self.stars}
         if self.projections is not None:
             wanted = [name for name in self.tallies if name.startswith("figure")]

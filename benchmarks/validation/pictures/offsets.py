@@ -169,7 +169,7 @@ SKYLESS = (points_anywhere, clusters, streaks, horizons, grids, double_points)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure, print, and write the page if asked to; 1 where a figure is out of bounds."""
+    """Command that measures, prints, and writes the page on request; 1 if out of bounds."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
