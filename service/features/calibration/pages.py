@@ -56,8 +56,10 @@ def parameters(found: CalibrationSummary, file: Mission) -> dict[str, tuple[floa
 
 
 def _of_magnitudes(name: str, trackers: Sequence[TrackerGeometry], tracker: str) -> float:
-    """What settings say of a tracker: how much fainter it measures a star of `STAR_MAG`, how many
-    magnitudes it measures for one of the catalog, or its colour term.
+    """Value of a magnitude unknown in a tracker's settings.
+
+    For a zero point, the measured magnitude of a star of `STAR_MAG`; for a scale, the measured
+    magnitudes per catalog magnitude; or the colour term.
     """
     own = {each.name: each.magnitudes or AS_MEASURED for each in trackers}
     if name.endswith(COLOR):

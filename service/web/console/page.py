@@ -1,4 +1,4 @@
-"""What every page of the console is made of: registration, context, layout, rendering.
+"""Common parts of all console pages: registration, context, layout, rendering.
 
 A page is a module that calls `console_page`; see `service.web.console.pages`.  Routes,
 navigation, titles and access policies derive from that call.
@@ -43,7 +43,7 @@ Handler = Callable[..., Any]
 
 @dataclass(frozen=True)
 class ConsolePage:
-    """A page of the console.
+    """Page of the console.
 
     `section` is the path of the navigation entry that is marked on the page.
     `position` orders the entries of the navigation; a page without one has no entry.
@@ -57,7 +57,7 @@ class ConsolePage:
 
 
 PAGES: dict[str, ConsolePage] = {}
-"""Every page by the name of its route."""
+"""All pages, by the name of their route."""
 
 
 def console_page(
@@ -74,7 +74,7 @@ def console_page(
 
 
 def navigation() -> list[ConsolePage]:
-    """The pages of the navigation, in its order."""
+    """Pages of the navigation, in its order."""
     return sorted(
         (page for page in PAGES.values() if page.position is not None),
         key=lambda page: page.position or 0,
@@ -82,12 +82,12 @@ def navigation() -> list[ConsolePage]:
 
 
 class PageQuery(Query):
-    """The run that a page shows; every page takes it."""
+    """Query that selects the run of a page; every page has it."""
 
     run: Run = LIVE
 
     def address(self, **changed: Any) -> dict[str, Any]:
-        """The parameters of this page with some changed; those at their default are left out."""
+        """Parameters of this page with some changed; default values are left out."""
         asked = {name: changed.get(name, value) for name, value in self if name != "run"}
         fields = type(self).model_fields
         kept = {name: value for name, value in asked.items() if value != fields[name].default}
@@ -98,19 +98,19 @@ class PageQuery(Query):
 
 
 def typed_utc(text: str, field: str) -> Utc:
-    """A time as people type it; raises `BadInput` naming the field."""
+    """Time as people type it; raises `BadInput` naming the field."""
     return parse_utc(completed_utc(text), field)
 
 
 class PeriodQuery(PageQuery):
-    """A period as people type it; an empty field stands for any time."""
+    """Query with a period as people type it; an empty field selects any time."""
 
     start: Annotated[str, Field(max_length=40)] = ""
     end: Annotated[str, Field(max_length=40)] = ""
 
     @property
     def bounds(self) -> dict[str, Utc | None]:
-        """Both ends by name; raises `BadInput` for what is no time."""
+        """Start and end of the period by name; raises `BadInput` for other text."""
         typed = {"start": self.start, "end": self.end}
         return {
             name: typed_utc(text, name) if text.strip() else None for name, text in typed.items()
@@ -118,14 +118,14 @@ class PeriodQuery(PageQuery):
 
 
 class SortedQuery(PageQuery):
-    """A table that is sorted by one of its columns."""
+    """Query of a table that is sorted by one of its columns."""
 
     descending: bool | None = None
 
 
 @dataclass(frozen=True)
 class RunChoice:
-    """A run to choose; `batches` is None where it holds none."""
+    """Run in the list of runs; `batches` is None if it has none."""
 
     name: str
     batches: int | None
@@ -133,10 +133,10 @@ class RunChoice:
 
 @dataclass(frozen=True)
 class AlarmCounts:
-    """How many alarms there are that are not cleared; each is counted once.
+    """Numbers of alarms that are not cleared; each alarm is counted once.
 
-    `open` are out of limits now and nobody has acknowledged them; `returned` are back in limits
-    and wait for that.
+    `open` alarms are out of limits and not acknowledged; `returned` alarms are back in limits and
+    not acknowledged.
     """
 
     open: int
@@ -144,11 +144,11 @@ class AlarmCounts:
     returned: int
     shelved: int
     worst: str | None
-    """The worst present severity of those that are out of limits and not shelved."""
+    """Greatest severity of the alarms that are out of limits and not shelved."""
 
 
 def alarm_counts(found: Sequence[Alarm]) -> AlarmCounts:
-    """The counts of alarms that are not cleared."""
+    """Numbers of alarms that are not cleared."""
     unshelved = [each for each in found if each.state != "shelved"]
     out = [each for each in unshelved if not each.in_limits]
     severities = [each.current_severity for each in out if each.current_severity]
@@ -163,7 +163,7 @@ def alarm_counts(found: Sequence[Alarm]) -> AlarmCounts:
 
 @dataclass(frozen=True)
 class Layout:
-    """The layout around the content of a page: its title, run, reader and time."""
+    """Layout around the content of a page: title, run, reader and time."""
 
     run: str
     runs: tuple[RunChoice, ...]
@@ -171,51 +171,51 @@ class Layout:
     section: str
     now: Utc
     last_event: int | None = None
-    """The number of the latest event when the page was begun; the page asks for later ones."""
+    """Number of the latest event before the page was read; the page asks for later ones."""
     stream: str | None = None
-    """The spacecraft whose events the page follows; None: all; "none": there is no such stream.
+    """Spacecraft whose events the page follows; None: all; "none": there is no event stream.
 
     "off": the page follows no events.
     """
     reader: str | None = None
-    """The name of the signed-in token; None while access is open."""
+    """Name of the signed-in token; None while access is open."""
     may_operate: bool = False
     address: str = ""
-    """The service's address, as the reader's browser has it."""
+    """Address of the service in the reader's browser."""
     alarms: AlarmCounts | None = None
-    """Alarms of the run, which every page counts; None: of a page that shows no run."""
+    """Alarms of the run, for the count on every page; None for a page without a run."""
     behind_s: float = 0.0
-    """How far trends and alarms are behind the record, where they could not be waited for."""
+    """Lag of trends and alarms behind the record, if waiting for them took too long."""
 
     @property
     def is_live(self) -> bool:
-        """True if live batches are shown and not those of a named run."""
+        """True if live batches are shown, not a named run."""
         return self.run == LIVE
 
     @property
     def navigation(self) -> list[ConsolePage]:
-        """The pages of the navigation, in its order."""
+        """Pages of the navigation, in its order."""
         return navigation()
 
     @property
     def other_runs(self) -> tuple[RunChoice, ...]:
-        """The runs that hold batches, other than the one shown."""
+        """Runs with batches, except the shown one."""
         return tuple(run for run in self.runs if run.batches and run.name != self.run)
 
 
 EMPTY_LAYOUT = Layout(LIVE, (RunChoice(LIVE, None),), "", "", present())
-"""The layout of pages without a reader: sign in, and errors."""
+"""Layout of pages without a reader: sign-in, and errors."""
 
 
 def open_layout(run: str, title: str, section: str) -> Layout:
-    """The layout of a page that needs no token and shows nothing that is recorded."""
+    """Layout of a page that needs no token and shows no recorded data."""
     runs = tuple(RunChoice(name, None) for name in dict.fromkeys((LIVE, run)))
     return Layout(run, runs, title, section, now=present(), stream="off")
 
 
 @dataclass(frozen=True)
 class Panel:
-    """A part of a page that a feature draws: its template, which sees `values`."""
+    """Part of a page that a feature draws: its template, with `values`."""
 
     template: str
     values: Any
@@ -223,10 +223,10 @@ class Panel:
 
 @dataclass(frozen=True)
 class PageContext:
-    """The context of the handler of a page.
+    """Context for the handler of a page.
 
-    `last_event` is read before anything else: the page may hear of something
-    that it shows already, but never misses anything.
+    `last_event` is read before all other data: so the page may hear of an event that it already
+    shows, but never misses one.
     """
 
     app: App
@@ -237,15 +237,15 @@ class PageContext:
 
     @property
     def may_operate(self) -> bool:
-        """True if the reader may change something."""
+        """True if the reader may make changes."""
         return "operate" in self.caller.scopes
 
     def rendered(self, template: str, run: str, **values: Any) -> Response:
-        """The page, which shows a run."""
+        """Rendered page with a run."""
         return rendered(template, self._layout(run), **values)
 
     def panels(self, page: str, *shown: Any) -> list[Any]:
-        """What features add to a page, by the name of its handler; `shown` is what it shows."""
+        """Parts that features add to a page, by the name of its handler; `shown` is its content."""
         modules = feature_modules("pages", self.app.settings.features_off)
         makers = (getattr(module, "PANELS", {}).get(page) for module in modules)
         return [panel for make in makers if make is not None for panel in make(self, *shown)]
@@ -279,19 +279,19 @@ class PageContext:
 
     @property
     def spacecraft(self) -> list[str]:
-        """The spacecraft that the reader may see, retired ones too."""
+        """Names of the spacecraft that the reader may see, including retired ones."""
         return [name for name in sorted(self.app.context.known) if self.caller.may_see(name)]
 
     @property
     def first_spacecraft(self) -> str:
-        """The first spacecraft that the reader may see, with a mission if there is one.
+        """First spacecraft that the reader may see, with a mission if possible.
 
-        A token may be bound to spacecraft alone that have no mission file any more.
+        A token may be bound only to spacecraft that have no mission file any more.
         """
         return (self.spacecraft or sorted(self.caller.spacecraft or ()))[0]
 
     def listed(self, spacecraft: str) -> str:
-        """The spacecraft of a list: the asked one; empty for all, of which some see one alone."""
+        """Spacecraft of a list: the requested one, the first of a bound token, or empty: all."""
         if spacecraft:
             self.caller.require(spacecraft)
         elif self.caller.spacecraft is not None:
@@ -299,7 +299,7 @@ class PageContext:
         return spacecraft
 
     def filled_spacecraft(self, run: str) -> str:
-        """The first spacecraft with batches in a run; without any, the first one."""
+        """First spacecraft with batches in a run, or the first of all."""
         found = {
             name
             for each in self.app.runs.all(self.caller.spacecraft)
@@ -330,7 +330,7 @@ HEADERS: Mapping[str, str] = {
 
 @pass_context
 def _to(context: Context, path: str, /, **query: object) -> str:
-    """An address of the console that keeps the shown run."""
+    """Address of a console page that keeps the shown run."""
     run = query.pop("run", context["layout"].run)
     asked = {} if run == LIVE else {"run": run}
     asked |= {name: value for name, value in query.items() if value is not None}
@@ -341,14 +341,14 @@ _DOCUMENTED = re.compile(r'href="(/(?:docs|problems)[^"#]*)')
 
 
 def _of_run(text: Markup, run: str) -> Markup:
-    """A kept part of a page whose links to other pages keep the shown run."""
+    """Kept part of a page, with links to other pages that keep the shown run."""
     if run == LIVE:
         return text
     return Markup(_DOCUMENTED.sub(rf'href="\1?{urlencode({"run": run})}', str(text)))
 
 
 def _data(value: object) -> Markup:
-    """Values for a script, in a `template` element: escaped like any text."""
+    """Values for a script as a `template` element, escaped like any text."""
     return Markup("<template data-json>{}</template>").format(msgspec.json.encode(value).decode())
 
 
@@ -373,13 +373,13 @@ _ENVIRONMENT = _environment()
 
 
 def rendered(template: str, layout: Layout, status: int = 200, **values: Any) -> Response:
-    """A page of the console."""
+    """HTML response with a page of the console."""
     text = _ENVIRONMENT.get_template(template).render(layout=layout, **values)
     return HTMLResponse(text, status, headers=dict(HEADERS))
 
 
 def rendered_part(template: str, **values: Any) -> Markup:
-    """A part of a page that depends on neither reader nor run, so that it can be kept."""
+    """Part of a page that depends on neither reader nor run, and can be kept."""
     return Markup(_ENVIRONMENT.get_template(template).render(**values))
 
 
@@ -387,7 +387,7 @@ _OWN_ADDRESS = re.compile(rb'\b(href|src|action)="/(?!/)')
 
 
 def below_path(request: Request, page: Response) -> Response:
-    """A page whose addresses begin with the path below which a proxy serves the service."""
+    """Page whose addresses begin with the path below which a proxy serves the service."""
     root = root_path(request).encode()
     if not root or not isinstance(page, HTMLResponse):
         return page
@@ -398,10 +398,10 @@ def below_path(request: Request, page: Response) -> Response:
 
 
 class PageRoute(APIRoute):
-    """A route whose errors are pages for people."""
+    """Route that answers errors with pages for people."""
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
-        """The handler, with every expected error turned into a page."""
+        """Handler that answers every expected error with a page."""
         inner = super().get_route_handler()
 
         async def handler(request: Request) -> Response:
@@ -424,7 +424,7 @@ class PageRoute(APIRoute):
 
 
 async def page_or_problem(request: Request, error: Exception) -> Response:
-    """What a browser that follows a link to no page gets is a page; all others get a problem."""
+    """Answer to an unknown address: a page for a browser that follows a link, or a problem."""
     is_page = not request.url.path.startswith(("/api/", "/static/"))
     asks_for_page = "text/html" in request.headers.get("accept", "")
     if not (isinstance(error, HTTPException) and error.status_code == 404):

@@ -1,4 +1,4 @@
-"""The page of annotations: notes of people on times and periods."""
+"""Page of annotations: notes of people on times and periods."""
 
 from typing import Literal
 
@@ -13,11 +13,11 @@ from service.web.requests.query_parameters import Cursor
 
 ANNOTATION_ROWS = 50
 AROUND_S = 1800.0
-"""Before and after an annotation: what the link to the trends shows."""
+"""Seconds before and after an annotation in the linked trends."""
 
 
 class AnnotationsQuery(PeriodQuery):
-    """Which annotations; an empty field of the form stands for any value."""
+    """Query that selects annotations; an empty form field selects any value."""
 
     spacecraft: Key | Literal[""] = ""
     cursor: Cursor = None
@@ -25,7 +25,7 @@ class AnnotationsQuery(PeriodQuery):
 
 @console_page("/annotations", "Annotations", Policy("read", "nothing"), position=25)
 def annotations_page(query: FromQuery[AnnotationsQuery], context: ContextDep) -> Response:
-    """The annotations of a period, the latest written first."""
+    """Page with the annotations of a period, the latest written first."""
     query = query.model_copy(update={"spacecraft": context.listed(query.spacecraft)})
     page = context.app.annotations.page(
         spacecraft=query.spacecraft or None,
@@ -44,7 +44,7 @@ def annotations_page(query: FromQuery[AnnotationsQuery], context: ContextDep) ->
 
 
 def _around(annotation: Annotation) -> dict[str, str]:
-    """The period of the trends about an annotation."""
+    """Period of the trends about an annotation."""
     end = annotation.end or annotation.start
     return {
         "start": shifted(recorded_utc(annotation.start), -AROUND_S).text,

@@ -1,4 +1,4 @@
-"""The pages of batches: the list, one with star field, votes and what-if; and of a picture."""
+"""Pages of batches: the list, and one batch with star field, votes and what-if."""
 
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
@@ -47,19 +47,19 @@ from service.web.requests.access import Policy
 from service.web.requests.query_parameters import Cursor
 
 VIEWS = ("all", "field")
-"""The content of the chart: all candidates of the answer, or the field of view alone."""
+"""Content of the chart: all candidates of the answer, or the field of view only."""
 
 MUCH_WORSE = 2.0
-"""A new residual of more than so many times the former and the predicted one is warned of."""
+"""Greatest ratio of a new residual to the former and the predicted one without a warning."""
 SCALE = 3.0
-"""The least range of the bars of the trackers' residuals, in predicted residuals."""
+"""Least range of the bars of the trackers' residuals, in predicted residuals."""
 
 ResultId = Annotated[str, Path()]
 
 
 @dataclass(frozen=True)
 class VoteRow:
-    """One row of the vote table: the observed star, its identification, and the one before."""
+    """Row of the vote table: observed star, its identification, and the previous one."""
 
     tracker: str
     number: int
@@ -70,7 +70,7 @@ class VoteRow:
 
     @property
     def why(self) -> str:
-        """Why it is not unique, with the rivals, and what would make it so; empty if it is."""
+        """Reason why a star is not unique, its rivals, and a remedy; empty for a unique star."""
         found = self.found
         if found.outcome == "unique":
             return ""
@@ -94,7 +94,7 @@ class VoteRow:
 
     @property
     def changed(self) -> bool:
-        """True if a what-if identifies it differently."""
+        """True if a what-if identifies the star differently."""
         return self.before is not None and (
             (self.found.outcome, self.found.star) != (self.before.outcome, self.before.star)
         )
@@ -102,9 +102,9 @@ class VoteRow:
 
 @console_page("/batches/{id}", "Batch", Policy("read", "result"), section="/batches")
 def batch_page(request: Request, id: ResultId, context: ContextDep) -> Response:
-    """One result: star field, votes, attitude, provenance; with options in the query, a what-if.
+    """Page of one result: star field, votes, attitude, provenance; or a what-if with options.
 
-    An id that a sender gave its batch leads to the search for it.
+    An id from the sender of a batch leads to the search for it.
     """
     query = dict(request.query_params)
     if not is_ulid(id):
@@ -156,7 +156,7 @@ def batch_page(request: Request, id: ResultId, context: ContextDep) -> Response:
 
 
 def adoption(before: Answer, after: Answer) -> list[str]:
-    """The changes that adopting a what-if will make, in sentences."""
+    """Sentences about the changes by adopting a what-if."""
     words = ("unique", "ambiguous", "unmatched")
     changes = [
         f"{word} stars {getattr(before.counts, word)} to {getattr(after.counts, word)}"
@@ -178,7 +178,7 @@ def adoption(before: Answer, after: Answer) -> list[str]:
 
 
 def _worse_fit(before: Answer, after: Answer) -> list[str]:
-    """A warning with both figures where the residuals of the new attitude are much larger."""
+    """Warning with both figures if the residuals of the new attitude are much larger."""
     if after.attitude is None:
         return ["▲ The new result has no attitude."] if before.attitude else []
     if after.attitude.residual_rms_arcsec is None:
@@ -220,7 +220,7 @@ def _stars(shown: Answer, before: Answer | None, field: StarField) -> list[VoteR
 
 
 def _trackers(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Each tracker with its residual over the predicted one, on one scale for all."""
+    """Residual of each tracker over the predicted one, on a common scale."""
     ratio_of = QUANTITIES["residual_ratio"].value_of
     ratios = [ratio_of(row) for row in rows]
     scale = max(SCALE, *(each or 0.0 for each in ratios)) if ratios else SCALE
@@ -231,7 +231,7 @@ def _trackers(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _pointing(shown: Answer) -> list[dict[str, Any]]:
-    """The directions of the body axes by each method, which a quaternion does not show."""
+    """Directions of the body axes by each method, as readable form of the quaternions."""
     solved = shown.attitude
     if solved is None:
         return []
@@ -253,23 +253,23 @@ def _pointing(shown: Answer) -> list[dict[str, Any]]:
 
 ROWS = 50
 Any_ = Literal[""]
-"""An empty field of a form: any value."""
+"""Empty field of a form: any value."""
 
 
 class BatchesQuery(PeriodQuery):
-    """Which batches; empty fields of the form are left out."""
+    """Query that selects batches; empty form fields are left out."""
 
     spacecraft: Key | Any_ = ""
     outcome: OutcomeName | Any_ = ""
     status: StatusName | Any_ = ""
     find: Annotated[str, Field(max_length=200)] = ""
-    """The id that a batch has of its sender, or of this service; or a time."""
+    """Id of a batch from its sender or from this service; or a time."""
     cursor: Cursor = None
 
 
 @console_page("/batches", "Batches", Policy("read", "nothing"), position=30)
 def batches_page(query: FromQuery[BatchesQuery], context: ContextDep) -> Response:
-    """The batches of a run, newest first."""
+    """Page with the batches of a run, newest first."""
     query = query.model_copy(update={"spacecraft": context.listed(query.spacecraft)})
     moment, nearest = None, list[tuple[Summary, float]]()
     if text := query.find.strip():
@@ -307,7 +307,7 @@ def batches_page(query: FromQuery[BatchesQuery], context: ContextDep) -> Respons
 
 
 def _nearest(context: PageContext, query: BatchesQuery, moment: Utc) -> list[tuple[Summary, float]]:
-    """The batches before and after a time, the nearer first, and how many seconds off each is."""
+    """Batches before and after a time, the nearer first, and their offsets in seconds."""
     found = context.app.results.around(moment, query.run, query.spacecraft or None)
     offsets = [
         (each, (recorded_utc(each.time).tai_ns - moment.tai_ns) * 1e-9)
@@ -318,7 +318,7 @@ def _nearest(context: PageContext, query: BatchesQuery, moment: Utc) -> list[tup
 
 
 def named(context: PageContext, query: BatchesQuery, text: str) -> list[Summary]:
-    """The batches with an id, first of the shown run, else of every run."""
+    """Batches with an id, of the shown run if possible, otherwise of all runs."""
     name = context.app.results.spacecraft_of(text)
     if name is not None and context.caller.may_see(name):
         answer = context.app.results.get(text).answer

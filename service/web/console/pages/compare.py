@@ -1,4 +1,4 @@
-"""The pages of runs and replays, and the one that compares runs or sets of options."""
+"""Pages of runs and replays, and of comparisons between runs or sets of options."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -24,15 +24,15 @@ from service.web.console.page import ContextDep, FromQuery, PageQuery, PeriodQue
 from service.web.requests.access import READ, Policy
 
 SAMPLE = 2_000
-"""Batches that two sets of options are compared over: about a second."""
+"""Number of batches in a comparison of two sets of options, which takes about a second."""
 SIDES = ("a", "b")
 SHARES = ("ambiguous", "unmatched")
 SPARK_SIZE = 360, 36
-"""Pixels: a year has a point a day."""
+"""Size in pixels of a sparkline: a year has a point per day."""
 
 
 class CompareQuery(PeriodQuery):
-    """Which batches; the options of the sides are parameters with the prefixes `a.` and `b.`.
+    """Query that selects batches; options of the sides have the prefixes `a.` and `b.`.
 
     With `other` the run is compared with that run, in the period or in all that both have.
     """
@@ -44,16 +44,16 @@ class CompareQuery(PeriodQuery):
 
 @dataclass(frozen=True)
 class DrawnTrends:
-    """A sparkline of each of two sides, to one scale."""
+    """Sparklines of two sides, on a common scale."""
 
     cell_s: int
     top: float
-    """The share that the top of a sparkline stands for."""
+    """Share at the top of the sparklines."""
     sparks: list[SparklineDrawing]
 
     @property
     def cells(self) -> str:
-        """The unit that a point of a sparkline counts, in words."""
+        """Period of one point of a sparkline, in words."""
         days = self.cell_s // DAY_S
         return {0: "hours", 1: "days"}.get(days, f"periods of {days} days")
 
@@ -70,7 +70,7 @@ async def _query(request: Request) -> CompareQuery:
 def compare_page(
     request: Request, query: Annotated[CompareQuery, Depends(_query)], context: ContextDep
 ) -> Response:
-    """A comparison of the shown run with another, or of two sets of options, once asked for."""
+    """Page that compares the shown run with another one, or two sets of options on request."""
     start, end = query.bounds.values()
     name = query.spacecraft or context.filled_spacecraft(query.run)
     runs = rates = None
@@ -114,14 +114,14 @@ def compare_page(
 
 
 def _drawn(cell_s: int, sides: Sequence[Mapping[str, Vector]]) -> DrawnTrends:
-    """A sparkline for each side, from shares of the stars in cells of time."""
+    """Sparklines of both sides, from shares of the stars in cells of time."""
     every = np.concatenate([values for shares in sides for values in shares.values()])
     top = common_top(float(np.nanmax(every, initial=0.0)))
     return DrawnTrends(cell_s, top, [sparkline(shares, top, *SPARK_SIZE) for shares in sides])
 
 
 def _shares(result: Comparison) -> list[dict[str, Vector]]:
-    """The shares of the stars on each side, in every cell of the period; NaN without a star."""
+    """Shares of the stars on each side in every cell of the period; NaN without a star."""
     moments_s = unix_seconds([recorded_utc(cell.start).tai_ns for cell in result.trend])
     place = ((moments_s - moments_s[:1]) // result.cell_s).astype(int)
     sides = []
@@ -149,9 +149,9 @@ def _moved(runs: RunComparison | None, result: Comparison | None) -> list[tuple[
 
 @console_page("/runs", "Runs", Policy("read", "nothing"), position=50)
 def runs_page(query: FromQuery[PageQuery], context: ContextDep) -> Response:
-    """Every run, and the replays and reprocessings with their progress.
+    """Page of all runs, and of replays and reprocessings with their progress.
 
-    A token that is bound to spacecraft sees the runs of these, and the replays into these runs.
+    A token that is bound to spacecraft sees their runs, and the replays into these runs.
     """
     bound = context.caller.spacecraft is not None
     return context.rendered(
@@ -167,7 +167,7 @@ def runs_page(query: FromQuery[PageQuery], context: ContextDep) -> Response:
 
 @console_page("/replays/{id}", "Replay", READ, section="/runs")
 def replay_page(id: str, query: FromQuery[PageQuery], context: ContextDep) -> Response:
-    """One replay: how far it is, and the faults of lines, each once with how many have it."""
+    """Page of one replay: its progress, and each fault of lines with its count."""
     replay = context.app.replays.get(id)
     alike: dict[str, list[RefusedLine]] = {}
     for each in replay.errors:

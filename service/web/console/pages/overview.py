@@ -1,4 +1,4 @@
-"""The first page: the state of every spacecraft, a row each, the worst first."""
+"""First page: the state of every spacecraft in a row, the worst first."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -20,7 +20,7 @@ from service.web.console.charts.sparkline import SparklineDrawing, common_top, p
 from service.web.requests.access import Policy
 
 STALE_AFTER_S = 3600.0
-"""A spacecraft is silent, or behind the latest batch of its run, from this long on."""
+"""Seconds after which a spacecraft counts as silent, or as behind the latest batch of its run."""
 Order = Literal["worst", "name", "behind", "ambiguous", "unmatched", "alarms"]
 Shown = Literal["all", "trouble", "alarm", "stale", "no_attitude", "no_batches"]
 SHOWN: dict[Shown, str] = {
@@ -32,21 +32,21 @@ SHOWN: dict[Shown, str] = {
     "no_batches": "no batches",
 }
 UNFOLDED = 20
-"""Rows that are shown without being asked for."""
+"""Number of rows that are shown by default."""
 MARKED_SHARE = 0.15
-"""The share of ambiguous or unmatched stars in the last hour: by default the bound of `watch`."""
+"""Share of ambiguous or unmatched stars in the last hour: by default the bound of `watch`."""
 _RANKS = {"no_attitude": 5, "critical": 5, "silent": 4, "behind": 4, "suspect": 3, "warning": 2}
-"""How bad each state is; every other fault has the rank 1."""
+"""Rank of each state by severity; every other fault has the rank 1."""
 SPARK_QUANTITIES = ("ambiguous_share", "unmatched_share")
 
 
 def share_names() -> tuple[str, ...]:
-    """The quantities of the heat map."""
+    """Quantities of the heat map."""
     return tuple(name for name, each in QUANTITIES.items() if each.is_share)
 
 
 class OverviewQuery(page.SortedQuery):
-    """Which rows, in which order, over which period."""
+    """Query that selects the rows, their order, and the period."""
 
     period: Period = "day"
     sort: Order = "worst"
@@ -54,25 +54,25 @@ class OverviewQuery(page.SortedQuery):
     show: Shown = "all"
     heat: Annotated[str, OneOf(share_names)] | None = None
     all: bool = False
-    """True if every row is shown; else the first ones, of what has sent something."""
+    """True if every row is shown; otherwise the first ones of spacecraft with data."""
 
 
 @dataclass(frozen=True)
 class StateFault:
-    """Something that is wrong with a spacecraft: a state of `formatting.STATES`, and words."""
+    """Fault of a spacecraft: a state of `formatting.STATES`, and words."""
 
     state: str
     words: str
 
     @property
     def rank(self) -> int:
-        """How bad it is."""
+        """Rank of the fault by severity."""
         return _RANKS.get(self.state, 1)
 
 
 @dataclass(frozen=True)
 class OverviewLine:
-    """One spacecraft's row; `place` is that of its cells."""
+    """Row of one spacecraft; `place` is the index of its cells."""
 
     item: FleetRow
     place: int
@@ -81,17 +81,17 @@ class OverviewLine:
 
     @property
     def is_silent(self) -> bool:
-        """True if the service has received no live batch of it for long."""
+        """True if the service has received no live batch of the spacecraft for long."""
         return self.is_live and not self.item.retired and _is_long(self.item.received_age_s)
 
     @property
     def is_stale(self) -> bool:
-        """True if it is silent or behind the run; a retired one sends nothing any more."""
+        """True if the spacecraft is silent or behind the run; never for a retired one."""
         return self.is_silent or (not self.item.retired and _is_long(self.item.age_s))
 
     @cached_property
     def faults(self) -> list[StateFault]:
-        """What is wrong with its attitude, trackers, alarms and freshness, the worst first."""
+        """Faults of the spacecraft in attitude, trackers, alarms and freshness, the worst first."""
         found = [*self._of_attitude(), *self._of_trackers()]
         if self.is_stale:
             state = "silent" if self.is_silent else "behind"
@@ -102,7 +102,7 @@ class OverviewLine:
         return sorted(found, key=lambda each: -each.rank)
 
     def _of_attitude(self) -> Iterator[StateFault]:
-        """The faults of the latest attitude, or else of those of the last hour."""
+        """Faults of the latest attitude, or otherwise of the attitudes of the last hour."""
         item, hour = self.item, self.item.last_hour
         if item.state in ("suspect", "no_attitude"):
             yield StateFault(item.state, item.state.replace("_", " "))
@@ -118,7 +118,7 @@ class OverviewLine:
                 yield StateFault("acquiring", f"{state.replace('_', ' ')} in {of}")
 
     def _of_trackers(self) -> Iterator[StateFault]:
-        """The trackers that identify none of their stars while others do."""
+        """Trackers that identify none of their stars while others do."""
         if not self.item.has_attitude or len(self.item.trackers) < 2:
             return
         for each in self.item.trackers:
@@ -127,16 +127,16 @@ class OverviewLine:
 
     @property
     def state(self) -> str:
-        """The worst of its faults; without any the state of its latest batch."""
+        """Worst fault of the spacecraft; without any the state of its latest batch."""
         return self.faults[0].state if self.faults else self.item.state
 
     @property
     def in_trouble(self) -> bool:
-        """True if it needs a look."""
+        """True if the spacecraft needs attention."""
         return bool(self.faults)
 
     def share(self, outcome: str) -> float:
-        """The share of an outcome in the last hour; -1 where nothing was observed."""
+        """Share of an outcome in the last hour; -1 without observed stars."""
         counts = self.item.last_hour
         if counts is None or not counts.observed:
             return -1.0
@@ -153,7 +153,7 @@ def _is_long(seconds: float | None) -> bool:
 
 @dataclass(frozen=True)
 class Notice:
-    """A problem that a feature reports, and the page that says more."""
+    """Problem that a feature reports, and the page with details."""
 
     text: str
     path: str
@@ -162,7 +162,7 @@ class Notice:
 
 @page.console_page("/", "Overview", Policy("read", "nothing"), position=10)
 def overview_page(query: page.FromQuery[OverviewQuery], context: page.ContextDep) -> Response:
-    """State, attitude, shares, alarms and age of every spacecraft in a run."""
+    """Page with state, attitude, shares, alarms and age of every spacecraft in a run."""
     fleet = context.app.spacecraft.fleet(
         context.spacecraft, query.run, query.period, context.caller.spacecraft
     )
@@ -198,7 +198,7 @@ def overview_page(query: page.FromQuery[OverviewQuery], context: page.ContextDep
 
 
 def _words_of(lines: list[OverviewLine]) -> str:
-    """How many of some rows are in trouble, without trouble, and without any batch."""
+    """Numbers of rows with faults, without faults, and without any batch."""
     silent = [line for line in lines if not line.item.latest_batch]
     trouble = [line for line in lines if line.in_trouble and line.item.latest_batch]
     parts = (
@@ -210,7 +210,7 @@ def _words_of(lines: list[OverviewLine]) -> str:
 
 
 def _shares(cells: FleetCells) -> dict[str, Matrix]:
-    """Every share with a history, of each spacecraft and cell; NaN without a batch."""
+    """Shares with a history, by spacecraft and cell; NaN without a batch."""
     found = {}
     for quantity in QUANTITIES.values():
         match quantity.source:
@@ -255,7 +255,7 @@ def _is_shown(line: OverviewLine, query: OverviewQuery) -> bool:
 
 
 def _sorted(lines: list[OverviewLine], query: OverviewQuery) -> list[OverviewLine]:
-    """The spacecraft in the asked order; the worst or the greatest first, names from A on."""
+    """Rows in the requested order: the worst or the greatest first, names from A on."""
     ordered = sorted(lines, key=lambda line: line.item.name)
     if query.sort == "name":
         return ordered[::-1] if query.descending else ordered
@@ -271,13 +271,13 @@ def _sorted(lines: list[OverviewLine], query: OverviewQuery) -> list[OverviewLin
 
 
 def _badness(line: OverviewLine) -> tuple[Any, ...]:
-    """The ranks of its faults from the worst on; then its share of ambiguous stars."""
+    """Sort key: the ranks of the faults from the worst on, then the share of ambiguous stars."""
     ranks = [each.rank for each in line.faults]
     return ranks, line.share("ambiguous"), line.share("unmatched"), len(line.item.alarms_returned)
 
 
 def _severity(line: OverviewLine) -> int:
-    """The worst severity of its alarms now; 0 without any."""
+    """Greatest severity of the present alarms; 0 without any."""
     words = [each.current_severity or each.severity for each in line.item.alarms_now]
     return max((int(Severity[word.upper()]) for word in words), default=0)
 
@@ -285,7 +285,7 @@ def _severity(line: OverviewLine) -> int:
 def _heat(
     fleet: Fleet, lines: list[OverviewLine], shares: dict[str, Matrix], period: Period
 ) -> dict[str, Any] | None:
-    """The heat map: its rows are those of the table, its quantities all shares."""
+    """Heat map with the rows of the table, and all shares as quantities."""
     shown = [line for line in lines if line.item.latest_batch]
     if fleet.cells is None or not shown:
         return None

@@ -1,4 +1,4 @@
-"""The page of one spacecraft: trends over a period, its worst and its latest batches."""
+"""Page of one spacecraft: trends over a period, its worst and its latest batches."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -45,9 +45,9 @@ UNITS_S = {"min": 60, "h": HOUR_S, "d": DAY_S, "w": 7 * DAY_S}
 Range = Annotated[
     str, Field(pattern=rf"^({'|'.join(RANGES_S)}|[1-9][0-9]{{0,3}}({'|'.join(UNITS_S)}))$")
 ]
-"""The length of a period that ends with the latest batch: by its name, or such as `6h`."""
+"""Length of a period that ends with the latest batch: by name, or such as `6h`."""
 BEFORE_S = {"day": DAY_S, "week": 7 * DAY_S}
-"""How much earlier a period is that another is compared with."""
+"""Offset in time of an earlier period for comparison."""
 WORST, LATEST = 10, 10
 MOST_BESIDE = 4
 Vertical = Literal["robust", "all", "log"]
@@ -65,9 +65,9 @@ FIRST_LOOKED_AT: tuple[RankedName, ...] = (
 
 
 class SpacecraftQuery(PageQuery):
-    """Which period: a range that ends with the latest batch, or explicit bounds.
+    """Query that selects a period: a range before the latest batch, or explicit bounds.
 
-    Without any, a day of live batches, and of a named run the shortest range that holds it.
+    By default it is a day of live batches, or the shortest range that contains a named run.
     """
 
     range: Range | None = None
@@ -76,22 +76,22 @@ class SpacecraftQuery(PageQuery):
     by: RankedName | None = None
     tracker: Key | None = None
     until: Literal["latest", "now"] = "latest"
-    """The end of a range of live batches: the latest batch, or now."""
+    """End of a range of live batches: the latest batch, or now."""
     y: Vertical = "robust"
     beside: list[Annotated[str, Field(max_length=300)]] = Field(default_factory=list)
-    """Other spacecraft in the same charts; one text may name several, with commas between them."""
+    """Other spacecraft in the same charts; one text may name several, separated by commas."""
     before: Literal["", "day", "week"] = ""
-    """How much earlier the period is that charts draw in grey."""
+    """Offset of the earlier period that charts draw in grey."""
 
     @property
     def others(self) -> list[str]:
-        """The other spacecraft, as many as can be told apart."""
+        """Other spacecraft, as many as charts can distinguish."""
         names = (name.strip() for name in ",".join(self.beside).split(","))
         return list(dict.fromkeys(filter(None, names)))[:MOST_BESIDE]
 
     @property
     def kept(self) -> dict[str, str | None]:
-        """The query parameters that stay in the address while the period changes."""
+        """Query parameters that stay in the address while the period changes."""
         return {
             "by": self.by,
             "tracker": self.tracker,
@@ -104,7 +104,7 @@ class SpacecraftQuery(PageQuery):
     @field_validator("start", "end", "range", mode="before")
     @classmethod
     def _without_empty_fields(cls, value: object, info: ValidationInfo) -> object:
-        """A field of the form that was left empty counts as not given."""
+        """Treat an empty field of the form as missing."""
         default = cls.model_fields[info.field_name or ""].default
         if value == "":
             return default
@@ -113,7 +113,7 @@ class SpacecraftQuery(PageQuery):
 
 
 def range_s(text: str) -> int:
-    """The length of a range."""
+    """Length of a range."""
     if text in RANGES_S:
         return RANGES_S[text]
     number = text.rstrip("".join(UNITS_S))
@@ -122,7 +122,7 @@ def range_s(text: str) -> int:
 
 @dataclass(frozen=True)
 class ShownPeriod:
-    """The shown period; `range` is None where the address has explicit bounds."""
+    """Shown period; `range` is None if the address has explicit bounds."""
 
     range: str | None
     start: Utc
@@ -130,18 +130,18 @@ class ShownPeriod:
 
     @property
     def seconds(self) -> float:
-        """Its length."""
+        """Length of the period."""
         return (self.end.tai_ns - self.start.tai_ns) / 1e9
 
     @property
     def address(self) -> dict[str, str]:
-        """The query parameters that name it."""
+        """Query parameters that select the period."""
         if self.range:
             return {"range": self.range}
         return {"start": self.start.text, "end": self.end.text}
 
     def moved(self, by: float, scale: float = 1.0) -> dict[str, str]:
-        """The bounds of a period moved by parts of its length, longer or shorter."""
+        """Bounds of a period moved by parts of its length, longer or shorter."""
         middle_s = self.seconds * (0.5 + by)
         half_s = max(self.seconds * scale, 10.0) / 2
         return {
@@ -152,7 +152,7 @@ class ShownPeriod:
 
 @dataclass(frozen=True)
 class DrawnLimits:
-    """The limits that charts show, and when quantities were out of them, for the bars below."""
+    """Limits for charts, and the periods in which quantities were out of them."""
 
     limits: list[Limit]
     out: list[dict[str, Any]]
@@ -160,7 +160,7 @@ class DrawnLimits:
 
 @console_page("/spacecraft/{name}", "Spacecraft", Policy("read", "path"), section="/")
 def spacecraft_page(name: str, query: FromQuery[SpacecraftQuery], context: ContextDep) -> Response:
-    """Trends of one spacecraft in a run, its worst batches, and its latest ones."""
+    """Page of one spacecraft in a run: trends, worst batches, and latest ones."""
     state = context.app.spacecraft.state(name, query.run)
     latest = context.app.results.page(spacecraft=name, run=query.run, limit=LATEST).items
     stretch = shown_period(context, name, query, latest)
@@ -212,9 +212,9 @@ def spacecraft_page(name: str, query: FromQuery[SpacecraftQuery], context: Conte
 def shown_period(
     context: PageContext, name: str, query: SpacecraftQuery, latest: list[Summary] | None = None
 ) -> ShownPeriod | None:
-    """The period that the address names; None without any batch.
+    """Period that the address selects; None without any batch.
 
-    It ends with the first of the `latest` batches, which are read where they are not known yet.
+    It ends with the first of the `latest` batches, which are read if not given.
     """
     if latest is None:
         latest = context.app.results.page(spacecraft=name, run=query.run, limit=1).items
@@ -234,7 +234,7 @@ def shown_period(
 
 
 def _fitting_range(context: PageContext, name: str, run: str, end: Utc) -> Range:
-    """The range to show first: the shortest that holds the attitudes of a named run."""
+    """Range to show first: the shortest that contains the attitudes of a named run."""
     if run == LIVE:
         return "day"
     first = context.app.spacecraft.attitudes(name, run=run, limit=1).items
@@ -247,7 +247,7 @@ def _fitting_range(context: PageContext, name: str, run: str, end: Utc) -> Range
 def _worst(
     context: PageContext, name: str, query: SpacecraftQuery, stretch: ShownPeriod | None
 ) -> Ranking:
-    """The worst batches by a quantity: by default the first one with a value above zero."""
+    """Worst batches by a quantity: by default the first one with a value above zero."""
     asked = (query.by,) if query.by else FIRST_LOOKED_AT
     if query.tracker and not query.by:
         asked = tuple(by for by in FIRST_LOOKED_AT if QUANTITIES[by].by_tracker)
@@ -272,7 +272,7 @@ def _worst(
 
 
 def _others(context: PageContext, query: SpacecraftQuery, stretch: ShownPeriod | None) -> list[str]:
-    """The addresses of the histories of other spacecraft; raises for one that is not known."""
+    """Addresses of the histories of other spacecraft; raises for an unknown one."""
     for other in query.others:
         context.caller.require(other)
         context.app.context.mission(other)
@@ -286,7 +286,7 @@ def _others(context: PageContext, query: SpacecraftQuery, stretch: ShownPeriod |
 
 @dataclass(frozen=True)
 class PeriodBefore:
-    """The history of the same length some time earlier, and how much earlier."""
+    """History of an earlier period of equal length, and the offset in time."""
 
     history: str
     shift_s: int
@@ -315,7 +315,7 @@ def _changes(
     query: SpacecraftQuery,
     stretch: ShownPeriod | None,
 ) -> list[Change]:
-    """The changes of settings within a period of live batches, and within that before it."""
+    """Changes of settings within a period of live batches, and within the period before it."""
     if stretch is None or query.run != LIVE:
         return []
     earliest_ns = stretch.start.tai_ns - BEFORE_S.get(query.before, 0) * 10**9
@@ -336,7 +336,7 @@ def _changes(
 
 
 def _annotations(context: PageContext, name: str, stretch: ShownPeriod | None) -> Page[Annotation]:
-    """The annotations that touch the shown period."""
+    """Annotations that touch the shown period."""
     if stretch is None:
         return Page([], None)
     return context.app.annotations.page(
@@ -345,7 +345,7 @@ def _annotations(context: PageContext, name: str, stretch: ShownPeriod | None) -
 
 
 POINTS = 240
-"""The most points of a curve: as many as a chart can show."""
+"""Greatest number of points of a curve: as many as a chart can show."""
 CHARTS: Sequence[tuple[str, str, tuple[str, ...]]] = (
     ("stars", "Ambiguous and unmatched stars", ("ambiguous_share", "unmatched_share")),
     (
@@ -360,16 +360,16 @@ CHARTS: Sequence[tuple[str, str, tuple[str, ...]]] = (
     ("a-priori", "Angle from the a priori attitude", ("a_priori_angle_deg",)),
     ("rate", "Batches per hour", ("batches_per_hour",)),
 )
-"""Id, title and quantities of the charts; every other quantity gets one of its own."""
+"""Id, title and quantities of the charts; every other quantity has a chart of its own."""
 UNITS = {"1": "", "arcsec": "″", "deg": "°", "mag": " mag", "ppm": " ppm"}
 
 
 TRACKER_CHARTS = {"batches": "Batches in which the tracker disagrees with the others"}
-"""Titles that differ for the quantities of one tracker."""
+"""Chart titles that differ for the quantities of one tracker."""
 
 
 def charts(tracker: str | None = None) -> list[dict[str, Any]]:
-    """The charts of every quantity that has a history, or that a tracker has."""
+    """Charts of every quantity that has a history, or that a tracker has."""
     shown = {name for _, _, names in CHARTS for name in names}
     others = [
         (name.replace("_", "-"), QUANTITIES[name].label.capitalize(), (name,))
@@ -386,7 +386,7 @@ def charts(tracker: str | None = None) -> list[dict[str, Any]]:
 
 
 def charts_by_quantity() -> dict[str, dict[str, Any]]:
-    """The chart of each quantity that has a history, by itself."""
+    """Chart of each quantity that has a history."""
     return {
         quantity["name"]: chart
         | {"title": quantity["label"].capitalize(), "quantities": [quantity]}
@@ -409,7 +409,7 @@ def _chart(id: str, title: str, names: Sequence[str]) -> dict[str, Any]:
 def history_address(
     name: str, run: str, tracker: str | None, start: Utc, end: Utc, **more: object
 ) -> str:
-    """The address of the history of a period, as its charts read it."""
+    """Address from which the charts read the history of a period."""
     asked: dict[str, object] = {} if run == LIVE else {"run": run}
     if tracker:
         asked["tracker"] = tracker
