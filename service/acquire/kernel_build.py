@@ -55,7 +55,7 @@ class _Share(NamedTuple):
     whole_sky: list[str]
     """Identifiers that search the whole sky."""
     beside_batches: bool
-    """True if kernels that no batch needs are compiled too: links of points, features, pictures."""
+    """True if kernels that no batch needs are compiled too: features, pictures."""
 
 
 class KernelBuild:
@@ -278,7 +278,6 @@ STEPS = {
     "whole_sky": "index of the whole sky",
     "lost_in_space": "search of the whole sky",
     "triangles": "triangles",
-    "tracks": "links of points",
     "kernels": "features",
 }
 """Purpose of the kernels by folder of the kernel cache."""

@@ -20,7 +20,6 @@ from service.sky.cache import LruCache
 from service.sky.model import SkyModel
 from service.sky.zones import Zone
 from service.times import Utc, parse_utc
-from service.tracks.linking import compile_linking
 from service.vectors import quaternion_from_matrix, rotate_about
 
 ORION = 84.0, -1.0
@@ -135,10 +134,9 @@ def prewarm_kernels(
 
 
 def compile_beside_batches() -> None:
-    """Load the kernels, or compile them, of features, of links of points, and of pictures."""
+    """Load the kernels, or compile them, of features and of pictures."""
     for module in feature_modules("kernels", os.environ.get(SETTING, "")):
         module.compile_kernels()
-    compile_linking()
     compile_walk()
 
 

@@ -29,7 +29,6 @@ SOURCES = (
     "service/observations/scans",
     "service/simulate/scenes.py",
     "service/sky",
-    "service/tracks/extending.py",
     "service/csv_cells.py",
     "service/errors.py",
     "service/interpolation.py",

@@ -2,4 +2,4 @@
 
 from service.feature import Feature
 
-FEATURE = Feature("tracks", __name__, ("part", "command", "routes", "pages"))
+FEATURE = Feature("tracks", __name__, ("kernels", "part", "command", "routes", "pages"))

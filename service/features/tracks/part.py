@@ -9,13 +9,13 @@ from service.app.context import Context, known_id
 from service.app.factory import App
 from service.errors import NotFound
 from service.features.tracks import records as tracks
+from service.features.tracks.finding import Track as FoundTrack
+from service.features.tracks.finding import figures, find_tracks
+from service.features.tracks.linking import Batches, Points
 from service.features.tracks.tdm import TrackedObject, write_tdm
 from service.storage.queries.pages import ResultFilter
 from service.storage.recording.unsaved_result import LIVE
 from service.times import Utc, shifted, utc_now
-from service.tracks.finding import Track as FoundTrack
-from service.tracks.finding import figures, find_tracks
-from service.tracks.linking import Batches, Points
 from service.vectors import to_ra_dec
 
 MOST_BATCHES = 2_000

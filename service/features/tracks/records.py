@@ -10,6 +10,7 @@ from sqlalchemy import Connection, Select, select
 from service.contract.answers import Answer
 from service.contract.base import Count, Id, Moment, Record, doc
 from service.errors import BadBatch, Fault
+from service.features.tracks.linking import Gathering
 from service.missions.mission import Mission, Tracker
 from service.observations.calibrate import correct
 from service.observations.decode import batch_from_canonical
@@ -18,7 +19,6 @@ from service.storage.queries.pages import PLACE, ResultFilter
 from service.storage.queries.results import answer_from_json, read_result, recorded_mission
 from service.storage.sql.columns import Row
 from service.storage.sql.tables import batches, results
-from service.tracks.linking import Gathering
 from service.vectors import matrix_from_quaternion
 
 _ROWS: Select[Any] = select(

@@ -9,12 +9,12 @@ import erfa
 import numpy as np
 
 from service.acquire import acquire
+from service.features.tracks.linking import Gathering
 from service.observations.schema import BatchIn, submission_from_model
 from service.simulate.sightings import BatchScene, anywhere, real_sky, shaken
 from service.simulate.stretches import Stretch
 from service.sky.ephemeris import PLANETS, apparent, observer_velocity, planet_place
 from service.times import parse_utc, shifted
-from service.tracks.linking import Gathering
 from service.vectors import (
     ARCSEC_PER_RADIAN,
     matrix_from_quaternion,

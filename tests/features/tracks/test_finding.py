@@ -5,9 +5,10 @@ from collections import Counter
 import numpy as np
 import pytest
 
+from service.features.tracks.finding import figures, find_tracks
+from service.features.tracks.kernels import compile_kernels, count_seeds, extend, try_seeds
+from service.features.tracks.linking import Batches, Points
 from service.times import parse_utc, shifted
-from service.tracks.finding import figures, find_tracks
-from service.tracks.linking import Batches, Points
 from service.vectors import ARCSEC_PER_RADIAN, to_ra_dec, unit
 from tests.chance import at_least, at_most
 from tests.features.tracks.drawn import (
@@ -141,6 +142,17 @@ def anywhere(rng, count, each):
         :, :, None
     ]
     return unit(np.concatenate([off, np.ones((count, each, 1))], axis=2))
+
+
+def test_every_use_finds_what_was_compiled_at_the_start(rng):
+    compile_kernels()
+    turn = np.arange(40)[:, None] * np.array([[1e-4, 0.0]])
+    moved = unit(np.concatenate([turn, np.ones((40, 1))], axis=1))[:, None]
+    hot = np.tile([0.0, 0.0, 1.0], (40, 1, 1))
+    assert find_tracks(*made(rng, moved))
+    assert find_tracks(*made(rng, moved, on_detector=hot))
+    # Another kind of array would be compiled for itself.
+    assert [len(each.overloads) for each in (count_seeds, try_seeds, extend)] == [1, 1, 1]
 
 
 def test_points_without_order_make_no_track(rng):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from service.tracks.linking import fit_motion
+from service.features.tracks.linking import fit_motion
 from service.vectors import rotate_about, unit
 
 RATE = np.array([2e-4, -1e-4])

@@ -166,3 +166,16 @@ def try_seeds(  # type: ignore[no-untyped-def]
                 seeds[found, 0], seeds[found, 1], seeds[found, 2] = i, j, count
                 found += 1
     return found
+
+
+def compile_kernels() -> None:
+    """Compile the kernels by following one point through four batches."""
+    number = np.arange(4)
+    time_s = number.astype(np.float64)
+    places = np.stack([np.cos(time_s * 1e-4), np.sin(time_s * 1e-4), np.zeros(4)], axis=1)
+    variance, density = np.full(4, 1e-10), np.ones(4)
+    used, chosen = np.zeros(4, np.bool_), np.full(4, -1)
+    seen = Sightings(np.arange(5), number, time_s, places, variance, density, used, chosen)
+    seeds = np.empty((count_seeds(seen.first, 1), 3), np.int64)
+    assert try_seeds(1, 1.0, math.pi, 4, seen, seeds)
+    assert extend(0, 1, seen) == 4

@@ -16,13 +16,20 @@ import numpy as np
 import numpy.typing as npt
 
 from service.errors import BadInput, Fault
+from service.features.tracks.kernels import (
+    GATE,
+    MOST_CHANCE,
+    Sightings,
+    count_seeds,
+    extend,
+    try_seeds,
+)
 from service.missions.mission import Tracker
 from service.observations.batch import ObservationBatch, TrackerStars
 from service.observations.calibrate import CorrectedObservations
 from service.observations.focal_plane import tracker_vectors
 from service.sky.ephemeris import natural, observer_velocity
 from service.times import Utc
-from service.tracks.extending import GATE, MOST_CHANCE, Sightings, count_seeds, extend, try_seeds
 from service.vectors import ARCSEC_PER_RADIAN, Matrix, Vector, unit
 
 _NAMES = (
@@ -373,27 +380,6 @@ def link(points: Points, batches: int, *, rests: bool = False) -> Iterator[Link]
         if expected < math.log10(MOST_EXPECTED):
             used[own] = True
             yield Link(motion, own, expected)
-
-
-def compile_linking() -> None:
-    """Compile the kernels by linking a few points."""
-    count = LEAST_POINTS + 1
-    number = np.arange(count, dtype=np.int64)
-    places = np.stack([np.cos(number * 1e-4), np.sin(number * 1e-4), np.zeros(count)], axis=1)
-    points = Points(
-        trackers=("any",),
-        field_sr=np.ones(1),
-        batch=number,
-        tracker=np.zeros(count, np.int64),
-        number=number,
-        time_s=np.arange(0.0, count),
-        direction=places,
-        covariance=np.tile(np.eye(3) * 1e-10, (count, 1, 1)),
-        place=places,
-        sigma_rad=np.full(count, 1e-5),
-        magnitude_mag=np.full(count, np.nan),
-    )
-    assert len(list(link(points, count))) == 1
 
 
 def _end(points: Points, i: int, chosen: Indices, count: int) -> int:

@@ -10,9 +10,9 @@ from typing import Literal
 
 import numpy as np
 
+from service.features.tracks.kernels import GATE
+from service.features.tracks.linking import Batches, Indices, Link, Motion, Points, fit_motion, link
 from service.sky.ephemeris import PLANETS, Planet, planet_place
-from service.tracks.extending import GATE
-from service.tracks.linking import Batches, Indices, Link, Motion, Points, fit_motion, link
 from service.vectors import ARCSEC_PER_RADIAN, Vector, from_ra_dec, to_ra_dec
 
 TrackKind = Literal["moving", "planet", "fixed_on_sky", "fixed_on_detector", "fixed"]
