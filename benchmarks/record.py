@@ -30,7 +30,6 @@ CORE = (
     "service/compiled",
     "service/vectors.py",
     # Pictures of cameras without a mission: no batch passes through these.
-    ":!service/acquire/camera_calibration.py",
     ":!service/acquire/frame_submission.py",
     ":!service/acquire/picture.py",
     ":!service/identify/blind",

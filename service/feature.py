@@ -56,6 +56,7 @@ SHIPPED = (
     "definitive",
     "follow",
     "packets",
+    "pictures",
     "products",
     "tracks",
     "webhooks",

@@ -209,7 +209,7 @@ def test_a_service_is_ready_without_what_is_used_later(tmp_path):
     for late in (
         *("service.demo", "service.replay", "service.simulate", "studies"),
         *("service.identify.blind", "service.identify.triangles", "service.imaging.detection"),
-        *("service.imaging.frames.fits", "service.imaging.sky_overlay"),
+        *("service.imaging.frames.fits", "service.features.pictures.overlay"),
         *("service.features.products.ck", "service.features.products.scoring"),
         *("service.sky.whole_sky.quads", "service.storage.upkeep.archiving", "acquire_client"),
     ):

@@ -41,7 +41,6 @@ from service.imaging.detection.points import (
 )
 from service.imaging.frames.exif import is_by_rows, mirrored
 from service.imaging.frames.frame import Frame, require_light
-from service.imaging.sky_overlay import DrawnStar, SkyView, draw_sky
 from service.sky.catalog.proper_names import PROPER_NAMES
 from service.sky.catalog.star_catalog import Catalog
 from service.sky.ephemeris import apparent, observer_velocity
@@ -121,6 +120,11 @@ class PictureAttitude:
     def lens(self) -> Lens:
         """The lens that was fitted; its own axis need not be in the middle of the picture."""
         return self.fit.lens
+
+    @property
+    def lens_attitude(self) -> Matrix:
+        """The attitude (3, 3) whose z is the lens's own axis."""
+        return np.asarray(_of_the_middle(self.lens, np.eye(3)).T @ self.attitude)
 
     @cached_property
     def quaternion(self) -> Vector:
@@ -445,26 +449,6 @@ def blind_sky(catalog: Catalog, year: int | None = None) -> tuple[BrightStars, B
     """The bright stars of a catalog in a year, by default this one, and the solver over them."""
     sky = bright_stars(catalog, round(utc_now().julian_year) if year is None else year)
     return sky, BlindSolver(sky.direction)
-
-
-def overlay_of(result: PictureResult, title: str) -> bytes:
-    """The picture as PNG with its stars, their names, a grid and a scale."""
-    points, found = result.points, result.attitude
-    candidates = list(zip(points.u_px.tolist(), points.v_px.tolist(), strict=True))
-    view, stars = None, []
-    if found is not None:
-        ra_deg, dec_deg = found.boresight_deg
-        width_deg, height_deg = found.field_deg
-        title += (
-            f"   RA {ra_deg:.3f}° Dec {dec_deg:+.3f}° roll {found.roll_deg:.2f}°   "
-            f"{width_deg:.2f}° x {height_deg:.2f}°"
-        )
-        optical_axis = _of_the_middle(found.lens, np.eye(3)).T @ found.attitude
-        view = SkyView(found.lens.places, optical_axis, found.boresight_deg, found.field_deg)
-        stars = [DrawnStar(star.u_px, star.v_px, star.name or star.id) for star in found.stars]
-    return draw_sky(
-        points.light, points.noise_counts, points.binning, candidates, stars, view, title
-    )
 
 
 def places_of(points: PointSources) -> Points:

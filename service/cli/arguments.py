@@ -187,27 +187,42 @@ def add_command(
     the commands to begin with.  `parent` None creates the parser of the whole command.
     """
     if not summary:
-        summary, _, examples = (inspect.getdoc(function) or "").partition("\n\n")
-        summary = " ".join(summary.splitlines())
-    lines = [line.strip() for line in examples.strip().splitlines()]
-    epilog = "examples:\n" + "\n".join(f"  {line}" for line in lines)
-    arguments: dict[str, Any] = {
-        "description": textwrap.fill(summary, 79),
-        "epilog": f"{epilog}\n\n{notes}" if notes else epilog,
+        summary, examples = _help_of(function)
+    options: dict[str, Any] = {
         "formatter_class": argparse.RawDescriptionHelpFormatter,
         "allow_abbrev": False,
     }
+    made: argparse.ArgumentParser
     if parent is None:
-        whole = Parser(prog=name, **arguments)
-        whole.first = first.split()
-        return whole
-    # The list of commands has their first sentences.
-    brief = f"{summary.partition('. ')[0].rstrip('.')}."
-    made: argparse.ArgumentParser = parent.add_parser(name, help=brief, **arguments)
-    made.set_defaults(function=function)
+        made = Parser(prog=name, **options)
+    else:
+        # The list of commands has their first sentences.
+        brief = f"{summary.partition('. ')[0].rstrip('.')}."
+        made = parent.add_parser(name, help=brief, **options)
+        made.set_defaults(function=function)
+    _set_texts(made, summary, examples, notes)
     if isinstance(made, Parser):
         made.first = first.split()
     return made
+
+
+def describe(parser: argparse.ArgumentParser, function: Function, notes: str = "") -> None:
+    """Let a command that was added before run another function, whose docstring is the help."""
+    _set_texts(parser, *_help_of(function), notes)
+    parser.set_defaults(function=function)
+
+
+def _help_of(function: Function | None) -> tuple[str, str]:
+    """The summary and the examples in the docstring of a command's function."""
+    summary, _, examples = (inspect.getdoc(function) or "").partition("\n\n")
+    return " ".join(summary.splitlines()), examples
+
+
+def _set_texts(parser: argparse.ArgumentParser, summary: str, examples: str, notes: str) -> None:
+    lines = [line.strip() for line in examples.strip().splitlines()]
+    epilog = "examples:\n" + "\n".join(f"  {line}" for line in lines)
+    parser.description = textwrap.fill(summary, 79)
+    parser.epilog = f"{epilog}\n\n{notes}" if notes else epilog
 
 
 def add_group(parent: Any, name: str, summary: str, examples: str) -> Any:

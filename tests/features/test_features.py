@@ -52,6 +52,22 @@ def test_options_of_a_feature_that_is_off_are_not_there():
     assert found == {"packets", "xtce", "spacecraft"}
 
 
+def test_frames_are_of_a_spacecraft_where_pictures_of_any_camera_are_off(
+    acquire, monkeypatch, tmp_path
+):
+    monkeypatch.setenv("ACQUIRE_FEATURES_OFF", "pictures")
+    code, _, complaint = acquire("frame", "holiday.jpg")
+    assert (code, complaint) == (
+        2,
+        "acquire: --spacecraft: must name the spacecraft whose camera took the frames\n",
+    )
+    assert acquire("frame", "holiday.jpg", "--fov", "20")[0] == 2
+    acquire("simulate", "frames", "--spacecraft", "IMAGER", "--frames", 1, "drawn")
+    (frame,) = (tmp_path / "drawn").glob("*.fits")
+    code, out, _ = acquire("frame", frame, "--spacecraft", "IMAGER", "--in-process")
+    assert (code, "  good  " in out) == (0, True)
+
+
 def test_a_name_of_no_feature_is_refused_with_the_names_of_all(acquire, monkeypatch):
     monkeypatch.setenv("ACQUIRE_FEATURES_OFF", "follow, folow")
     code, _, complaint = acquire("version")
@@ -136,12 +152,13 @@ def test_with_every_feature_off_the_pages_are_there_and_nothing_of_a_feature_is(
     history = "/api/v1/spacecraft/XTE/history?format=csv"
     gone = ("/webhooks", "/alarms", "/api/v1/alarms", "/api/v1/spacecraft/XTE/tracks")
     gone += ("/spacecraft/XTE/files", "/api/v1/spacecraft/XTE/attitude")
+    gone += ("/pictures", "/api/v1/pictures")
     gone += ("/spacecraft/XTE/grades", "/api/v1/spacecraft/XTE/definitive-attitude")
     off = ",".join(SHIPPED)
     commands, modules, found = served(
         tmp_path, off, *pages, *gone, history, "/metrics", sent="docs/example-batch.json"
     )
-    assert not commands & {*SHIPPED, "export", "score", "calibrate", "smooth"}
+    assert not commands & {*SHIPPED, "export", "score", "calibrate", "camera", "smooth"}
     assert {"serve", "replay", "history"} <= commands
     assert [found[each][0] for each in pages] == [200] * len(pages)
     assert found[history][0] == 200
@@ -153,7 +170,7 @@ def test_with_every_feature_off_the_pages_are_there_and_nothing_of_a_feature_is(
     assert "sky, residuals, rates" in found["/spacecraft/XTE"][1]
     shown = found["/"][1] + found["/spacecraft/XTE"][1] + found["/missions"][1]
     shown += found["/spacecraft/XTE/period"][1]
-    for gone_page in ("/alarms", "/calibration", "/files", "/attitude?", "/grades"):
+    for gone_page in ("/alarms", "/calibration", "/files", "/attitude?", "/grades", "/pictures"):
         assert gone_page not in shown
     loaded = {each for each in modules if each.startswith("service.features.")}
     # The names of the features, and the tables, which stay in the database.

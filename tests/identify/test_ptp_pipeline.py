@@ -44,7 +44,7 @@ magnitude_sigma_mag = 0.5
 CONDITIONS = Conditions(position_px=1.0, magnitude_sigma_mag=0.0, fewest=7)
 OFF_RIGHT, OFF_TURN = 0.1, 1.0
 """Degrees: what counts as right."""
-PICTURES = Path(__file__).parents[1] / "pictures"
+PICTURES = Path(__file__).parents[1] / "features" / "pictures"
 REAL = json.loads((PICTURES / "truth.json").read_text("utf-8"))["pictures"]
 
 

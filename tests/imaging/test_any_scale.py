@@ -19,7 +19,7 @@ from service.imaging.frames.files import read_frame
 from service.imaging.frames.frame import Frame, FrameLimits
 from service.simulate.frames import FrameSettings, draw_frames
 from service.sky.catalog.star_catalog import load_embedded
-from tests.pictures.drawn import draw_picture
+from tests.features.pictures.drawn import draw_picture
 from tests.scale import draws
 
 LIMITS = FrameLimits(2_000_000)

@@ -18,8 +18,8 @@ from service.identify.blind.solver import focal_px_of
 from service.imaging.frames.files import read_frame
 from service.imaging.frames.frame import FrameLimits
 from service.sky.catalog.star_catalog import load_embedded
+from tests.features.pictures.drawn import draw_picture
 from tests.mutations import with_right_sums
-from tests.pictures.drawn import draw_picture
 from tests.scale import size
 
 MUTATIONS = 1_000_000

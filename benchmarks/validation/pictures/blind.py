@@ -34,7 +34,7 @@ from benchmarks.validation.pictures.peers import YEAR, PictureSolver, solvers
 from service.acquire.picture import blind_sky
 from service.sky.catalog.star_catalog import load_embedded
 from service.vectors import ARCSEC_PER_RADIAN, Matrix, Vector, attitude_error_arcsec
-from tests.pictures.drawn import draw_picture, middle_attitude
+from tests.features.pictures.drawn import draw_picture, middle_attitude
 
 PICTURES, QUICK_PICTURES = 500, 8
 TOLD = ("within 10 %", "nothing")

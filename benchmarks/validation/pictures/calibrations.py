@@ -25,13 +25,13 @@ from benchmarks.bounds import at_least, between
 from benchmarks.record import record_of
 from benchmarks.report import Report
 from benchmarks.validation.pictures.document import SOURCES, write_part
-from service.acquire.camera_calibration import CameraCalibration, calibrate_camera
 from service.acquire.picture import PictureResult, blind_sky, solve_picture
+from service.features.pictures.camera_calibration import CameraCalibration, calibrate_camera
 from service.identify.blind.lens import Lens
 from service.identify.blind.solver import focal_px_of, rotation_between
 from service.imaging.frames.frame import Frame
 from service.sky.catalog.star_catalog import load_embedded
-from tests.pictures.drawn import SIZES, DrawnPicture, draw_picture
+from tests.features.pictures.drawn import SIZES, DrawnPicture, draw_picture
 
 RUNS, QUICK_RUNS, PICTURES, YEAR = 100, 3, 10, 2020
 WITHIN_SIGMAS, WITHIN_LEAST = 3.0, 0.97

@@ -7,14 +7,14 @@ from benchmarks.sections import tables_of
 DOCUMENT = ROOT / "docs" / "cameras.md"
 SOURCES = (
     "catalogs/stars.npz",
-    "service/acquire/camera_calibration.py",
     "service/acquire/picture.py",
+    "service/features/pictures/camera_calibration.py",
     "service/identify/blind",
     "service/imaging/detection/points.py",
     "service/imaging/frames",
     "service/sky/whole_sky",
     "service/vectors.py",
-    "tests/pictures/drawn.py",
+    "tests/features/pictures/drawn.py",
     "benchmarks/validation/pictures",
 )
 """What the answer to a picture depends on."""

@@ -3,7 +3,7 @@
 import json
 import math
 import sys
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -29,10 +29,7 @@ def add(commands: Any) -> None:
         first="--spacecraft --fov --a-priori --overlay --url --in-process",
     )
     parser.add_argument("files", nargs="+", type=Path, metavar="FILE")
-    parser.add_argument(
-        "--spacecraft", metavar="NAME", help=f"{arguments.CAMERA_MISSION}; none: any camera"
-    )
-    _add_lens(parser)
+    parser.add_argument("--spacecraft", metavar="NAME", help=arguments.CAMERA_MISSION)
     parser.add_argument(
         "--tracker", metavar="NAME", help="default: the first tracker with a camera"
     )
@@ -67,59 +64,24 @@ def add(commands: Any) -> None:
         type=Path,
         metavar="OUT.png",
         help="write an image of the frame with stars, names and residuals; for several frames, "
-        "a folder; without a spacecraft the default is FILE-stars.png",
+        "a folder",
     )
     parser.add_argument("--json", action="store_true", help="print the answers, one per line")
     arguments.add_database(parser)
 
 
-def _add_lens(parser: ArgumentParser) -> None:
-    """Add options on the lens of pictures from an unknown camera."""
-    lens = parser.add_argument_group(
-        "without a spacecraft",
-        "known data of the camera; values of its lens may be wrong by a quarter",
-    )
-    lens.add_argument(
-        "--fov", type=arguments.degrees, metavar="DEG", help="field of view, the longer side"
-    )
-    lens.add_argument(
-        "--lens",
-        choices=("gnomonic", "equidistant", "equisolid", "stereographic"),
-        help="projection: gnomonic (on a plane) or of a fisheye; default: whatever fits",
-    )
-    lens.add_argument(
-        "--focal-px", type=arguments.positive, metavar="PX", help="focal length in pixels"
-    )
-    lens.add_argument("--focal-mm", type=arguments.positive, metavar="MM", help="with --pixel-um")
-    lens.add_argument(
-        "--pixel-um", type=arguments.positive, metavar="UM", help="the pitch of the pixels"
-    )
-    lens.add_argument(
-        "--dark", type=Path, metavar="FILE", help="a frame of the same exposure without light"
-    )
-
-
 def run(parsed: Namespace) -> int:
     """Detect the stars in frames and pictures (FITS, TIFF, PNG, JPEG, GIF, BMP, PGM, raw, .npy),
     identify them and solve for the attitude.  Frames of a spacecraft are recorded; one that is
-    sent again returns the first answer.  Without a spacecraft a picture may be from any camera:
-    its lens is fitted with the attitude, and nothing is recorded.
+    sent again returns the first answer.
 
-    acquire frame holiday.jpg                    any camera, any lens
-    acquire frame holiday.jpg --focal-mm 50 --pixel-um 4.8 --overlay stars.png
     acquire frame frames/*.fits --spacecraft IMAGER --overlay pictures/
     acquire frame one.fits --spacecraft IMAGER --in-process --overlay one.png
     acquire frame one.png --spacecraft IMAGER --time 2026-03-01T00:00:00Z --json
     """
     if parsed.spacecraft is None:
-        from service.cli.pictures import solve_pictures
-
-        return solve_pictures(parsed, arguments.settings_of(parsed))
-    for name in ("fov", "lens", "focal_px", "focal_mm", "pixel_um", "dark"):
-        value = getattr(parsed, name)
-        if value is not None:
-            message = "goes without --spacecraft; a mission's file describes its camera"
-            raise BadInput(Fault(f"--{name.replace('_', '-')}", message, shown_value(str(value))))
+        message = "must name the spacecraft whose camera took the frames"
+        raise BadInput(Fault("--spacecraft", message))
     if parsed.batch is not None and len(parsed.files) > 1:
         message = "names one frame; leave it out for several"
         raise BadInput(Fault("--batch", message, shown_value(parsed.batch)))

@@ -1,4 +1,4 @@
-"""API routes for frames of star trackers, and for pictures of any camera."""
+"""API routes for frames of star trackers."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,14 +12,12 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from service.contract.answers import Answer
-from service.contract.pictures import Picture
 from service.errors import BadBatch, Fault, shown_value
 from service.imaging.submit import FrameIn, read_known
 from service.missions.mission import mission_named
-from service.vectors import Projection
 from service.web.api.batches import answer_response
 from service.web.openapi import IDEMPOTENCY_KEY, LOCATION, REPLAYED, ApiRouter, Returns
-from service.web.requests.access import AppDep, CallerDep, MetricsDep, Policy, json_response
+from service.web.requests.access import AppDep, CallerDep, MetricsDep, Policy
 from service.web.requests.query_parameters import TIME_SCHEMA, FromQuery, Query, SpacecraftPath
 from service.web.requests.request_body import IdempotencyKey, frame_body
 
@@ -140,59 +138,3 @@ def submit_frame(
     if answered.replayed:
         metrics.count_repeat()
     return answer_response(answered)
-
-
-class PictureQuery(Query):
-    """Query with known properties of a picture's camera."""
-
-    spacecraft: Annotated[
-        str | None,
-        Field(
-            description="Whose camera took it. Default: a camera that the service does not know."
-        ),
-    ] = None
-    field_of_view_deg: Annotated[
-        float | None,
-        Field(gt=0, lt=180, description="Along the longer side; may be wrong by a quarter."),
-    ] = None
-    lens: Annotated[
-        Projection | None,
-        Field(description="How the lens projects the sky. Default: whatever fits."),
-    ] = None
-    image: Annotated[str | None, Field(description="As of a frame.", examples=["SCI"])] = None
-    overlay: Annotated[
-        bool, Field(description="Whether the answer holds the picture with the stars.")
-    ] = False
-
-
-async def _picture(request: Request, query: FromQuery[PictureQuery], app: AppDep) -> IO[bytes]:
-    return await frame_body(request, app.settings.frame_mb << 20)
-
-
-@router.serves(
-    "POST /pictures",
-    # It records nothing; the handler asks for access to the spacecraft that is named.
-    Policy("read", "nothing"),
-    Returns("What was found; nothing is recorded.", Picture),
-    frame=True,
-    problems=(404, 503),
-)
-def solve_picture(
-    query: FromQuery[PictureQuery],
-    file: Annotated[IO[bytes], Depends(_picture)],
-    app: AppDep,
-    caller: CallerDep,
-) -> Response:
-    """Find the stars, the attitude and the lens of a picture of any camera, and record nothing."""
-    with file:
-        if query.spacecraft is not None:
-            caller.require(query.spacecraft)
-        found = app.frames.picture(
-            file,
-            spacecraft=query.spacecraft,
-            field_of_view_deg=query.field_of_view_deg,
-            projection=query.lens,
-            image=query.image,
-            draws=query.overlay,
-        )
-    return json_response(found)

@@ -34,7 +34,6 @@ from service.web.console.options import (
     toml_of,
 )
 from service.web.console.page import (
-    HEADERS,
     ContextDep,
     FromQuery,
     PageContext,
@@ -332,28 +331,3 @@ def named(context: PageContext, query: BatchesQuery, text: str) -> list[Summary]
 def _listed(context: PageContext, run: str, spacecraft: str | None, text: str) -> list[Summary]:
     page = context.app.results.page(spacecraft=spacecraft, run=run, batch=text, limit=ROWS)
     return [each for each in page.items if context.caller.may_see(each.spacecraft)]
-
-
-# The script shows the drawn picture, which no address of the service has.
-_POLICY = HEADERS["Content-Security-Policy"].replace("img-src 'self'", "img-src 'self' blob:")
-
-
-@console_page("/pictures", "Pictures", Policy("read", "nothing"), position=60)
-def pictures_page(query: FromQuery[PageQuery], context: ContextDep) -> Response:
-    """Drop a picture: its attitude, stars and lens, and what to try if there are none."""
-    missions = context.app.missions
-    cameras = [
-        (name, tracker.camera)
-        for name in context.spacecraft
-        if name in missions
-        for tracker in [each for each in missions[name].trackers if each.camera][:1]
-    ]
-    page = context.rendered(
-        "pictures.html.jinja",
-        query.run,
-        cameras=cameras,
-        most_mb=context.app.settings.frame_mb,
-        most_megapixels=context.app.settings.frame_megapixels,
-    )
-    page.headers["Content-Security-Policy"] = _POLICY
-    return page

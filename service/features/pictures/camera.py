@@ -9,8 +9,8 @@ from service.cli.arguments import add_command, add_group, degrees, positive, set
 from service.errors import BadInput, Fault, printable, shown_value
 
 if TYPE_CHECKING:
-    from service.acquire.camera_calibration import CameraCalibration
     from service.acquire.picture import PictureResult
+    from service.features.pictures.camera_calibration import CameraCalibration
     from service.identify.blind.solver import BlindSolver
     from service.settings import Settings
     from service.sky.whole_sky.bright_stars import BrightStars
@@ -48,8 +48,8 @@ def run(parsed: Namespace) -> int:
     acquire camera calibrate pictures/*.jpg -o missions/mycam.toml
     acquire camera calibrate a.png b.png c.png --fov 12 --name MYCAM -o mycam.toml
     """
-    from service.acquire.camera_calibration import calibrate_camera
     from service.acquire.picture import blind_sky
+    from service.features.pictures.camera_calibration import calibrate_camera
     from service.sky.catalog.star_catalog import open_catalog
 
     settings = settings_of(parsed)
@@ -76,7 +76,7 @@ def _solved(
 ) -> list["PictureResult"]:
     """Pictures for which an attitude was found; for the others the reason is printed."""
     from service.acquire.picture import solve_picture
-    from service.cli.pictures import focal_guess_px, picture_reader
+    from service.features.pictures.any_camera import focal_guess_px, picture_reader
 
     read = picture_reader(parsed.dark, settings)
     used: list[PictureResult] = []
@@ -114,7 +114,7 @@ def _mission_name(parsed: Namespace) -> str:
 
 def _write_mission(output: Path, name: str, found: "CameraCalibration") -> None:
     """Write the mission file of a camera, after checking that it can be read."""
-    from service.acquire.camera_calibration import mission_text
+    from service.features.pictures.camera_calibration import mission_text
     from service.missions.mission import parse_mission
 
     text = mission_text(name, found)

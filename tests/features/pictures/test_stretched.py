@@ -15,7 +15,7 @@ from service.imaging.detection.points import find_points, without_dark
 from service.imaging.frames.frame import Frame
 from service.sky.catalog.star_catalog import load_embedded
 from service.vectors import ARCSEC_PER_RADIAN, attitude_error_arcsec
-from tests.pictures.drawn import draw_picture, jpeg_of, middle_attitude
+from tests.features.pictures.drawn import draw_picture, jpeg_of, middle_attitude
 from tests.scale import draws
 
 WIDTH, HEIGHT = 1200, 800

@@ -20,7 +20,7 @@ from service.imaging.frames.files import read_frame
 from service.imaging.frames.frame import Frame, FrameLimits
 from service.sky.catalog.star_catalog import load_embedded
 from service.vectors import ARCSEC_PER_RADIAN, attitude_error_arcsec
-from tests.pictures.drawn import draw_picture, jpeg_of, middle_attitude
+from tests.features.pictures.drawn import draw_picture, jpeg_of, middle_attitude
 from tests.scale import draws
 
 FOLDER = Path(__file__).parent

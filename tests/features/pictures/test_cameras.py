@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from service.acquire.camera_calibration import calibrate_camera
 from service.acquire.frame_submission import submit_frame
 from service.acquire.picture import blind_sky, solve_picture
 from service.cli import main
 from service.errors import BadBatch, BadConfiguration
+from service.features.pictures.camera_calibration import calibrate_camera
 from service.identify.blind.lens import Lens
 from service.identify.blind.solver import rotation_between
 from service.imaging.frames.frame import Frame
@@ -20,7 +20,7 @@ from service.imaging.submit import FrameIn
 from service.missions.mission import parse_mission, read_mission
 from service.sky.catalog.star_catalog import load_embedded
 from service.vectors import attitude_error_arcsec, matrix_from_quaternion
-from tests.pictures.drawn import draw_picture, jpeg_of
+from tests.features.pictures.drawn import draw_picture, jpeg_of
 from tests.scale import draws
 
 FOLDER = Path(__file__).parent

@@ -9,9 +9,9 @@ from PIL import Image
 
 from service.missions.mission import load_missions
 from service.simulate.frames import FrameSettings, draw_frames, frame_bytes
+from tests.features.pictures.test_over_http import PLEIADES
 from tests.web.browser import CHROMIUM
 from tests.web.fitting import faults
-from tests.web.test_frames import PLEIADES
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")
 

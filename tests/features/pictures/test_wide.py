@@ -14,7 +14,7 @@ from service.identify.blind.solver import focal_px_of
 from service.imaging.frames.frame import Frame
 from service.sky.catalog.star_catalog import load_embedded
 from service.vectors import attitude_error_arcsec, rotate_about
-from tests.pictures.trailed import add_path
+from tests.features.pictures.trailed import add_path
 from tests.scale import draws
 
 RADIUS = {

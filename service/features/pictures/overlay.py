@@ -2,15 +2,14 @@
 
 import io
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from service.imaging.frames.frame import CountArray
-from service.vectors import Matrix, Vector, from_ra_dec
+from service.acquire.picture import PictureAttitude, PictureResult
+from service.vectors import Vector, from_ra_dec
 
 MOST_SIDE_PX, LEAST_SIDE_PX = 1600, 800
 BLACK_SIGMAS, BEND_SIGMAS, WHITE_SIGMAS = -0.5, 3.0, 300.0
@@ -20,65 +19,41 @@ GRID_LINES = 4.0
 MOST_LABELS = 60
 _GRID, _STAR, _CANDIDATE, _TEXT = (60, 90, 130), (90, 220, 120), (150, 120, 70), (230, 230, 230)
 Box = tuple[float, float, float, float]
-Places = Callable[[Vector], tuple[Vector, Vector]]
-"""A function from directions (n, 3) in the camera's axes to places in pixels of the picture."""
 
 
-@dataclass(frozen=True)
-class DrawnStar:
-    """An identified star to draw at its measured place, with its label."""
+def overlay_of(result: PictureResult, title: str) -> bytes:
+    """A PNG of a picture's light, stretched by asinh, with candidates, stars, a grid and a scale.
 
-    u_px: float
-    v_px: float
-    label: str
-
-
-@dataclass(frozen=True)
-class SkyView:
-    """The mapping of the sky to a picture: projection, attitude (3, 3), boresight and field."""
-
-    places: Places
-    attitude: Matrix
-    boresight_deg: tuple[float, float]
-    field_deg: tuple[float, float]
-
-
-def draw_sky(
-    light: CountArray,
-    noise_counts: float,
-    binning: int,
-    candidates: Sequence[tuple[float, float]],
-    stars: Sequence[DrawnStar],
-    view: SkyView | None,
-    title: str,
-) -> bytes:
-    """A PNG of a picture's light above the background, with asinh stretch, stars, candidates and
-    grid.
-
-    `light` is binned by `binning` pixels of the picture a side; without a view only the candidates
-    are drawn. Overlapping labels are left out, with priority for the brightest stars, which come
-    first.
+    Without an attitude only the candidates are drawn.  Labels that would cover one another are
+    left out, those of the brightest stars, which come first, last.
     """
     from PIL import Image, ImageDraw, ImageFont
 
-    picture = Image.fromarray(_greys(light / max(noise_counts, 1e-9))).convert("RGB")
+    points, found = result.points, result.attitude
+    greys = _greys(points.light / max(points.noise_counts, 1e-9))
+    picture = Image.fromarray(greys).convert("RGB")
     scale = min(MOST_SIDE_PX / max(picture.size), 1.0)
     if max(picture.size) < LEAST_SIDE_PX:
         scale = float(-(-LEAST_SIDE_PX // max(picture.size)))
     size = (max(1, round(picture.width * scale)), max(1, round(picture.height * scale)))
     picture = picture.resize(size)
     draw, font = ImageDraw.Draw(picture), ImageFont.load_default(13)
-    pen = _Pen(draw, font, scale / binning, size)
-    if view is not None:
-        _draw_grid(pen, view)
-    for u, v in candidates:
+    pen = _Pen(draw, font, scale / points.binning, size)
+    if found is not None:
+        _draw_grid(pen, found)
+    for u, v in zip(points.u_px.tolist(), points.v_px.tolist(), strict=True):
         pen.circle(u, v, 4.0, _CANDIDATE)
-    for star in stars:
-        pen.circle(star.u_px, star.v_px, 8.0, _STAR)
-    for star in stars[:MOST_LABELS]:
-        pen.label(star.u_px, star.v_px, star.label, 9.0, _STAR)
-    if view is not None:
-        _draw_scale(pen, view)
+    if found is not None:
+        for star in found.stars:
+            pen.circle(star.u_px, star.v_px, 8.0, _STAR)
+        for star in found.stars[:MOST_LABELS]:
+            pen.label(star.u_px, star.v_px, star.name or star.id, 9.0, _STAR)
+        _draw_scale(pen, found.field_deg[0])
+        (ra_deg, dec_deg), (width_deg, height_deg) = found.boresight_deg, found.field_deg
+        title += (
+            f"   RA {ra_deg:.3f}° Dec {dec_deg:+.3f}° roll {found.roll_deg:.2f}°   "
+            f"{width_deg:.2f}° x {height_deg:.2f}°"
+        )
     pen.text(6, 4, title, _TEXT)
     file = io.BytesIO()
     picture.save(file, "PNG")
@@ -140,12 +115,12 @@ class _Pen:
         )
 
 
-def _draw_grid(pen: _Pen, view: SkyView) -> None:
+def _draw_grid(pen: _Pen, found: PictureAttitude) -> None:
     """Draw circles of right ascension and declination, labelled where they leave the picture."""
-    short = min(view.field_deg)
+    short = min(found.field_deg)
     step = _step_of(short / GRID_LINES)
-    ra, dec = view.boresight_deg
-    reach = 0.75 * math.hypot(*view.field_deg)
+    ra, dec = found.boresight_deg
+    reach = 0.75 * math.hypot(*found.field_deg)
     lowest, highest = max(dec - reach, -90.0), min(dec + reach, 90.0)
     away = max(abs(lowest), abs(highest))
     around = 180.0
@@ -155,15 +130,15 @@ def _draw_grid(pen: _Pen, view: SkyView) -> None:
     fine = np.linspace(-1.0, 1.0, 240)
     for value in _multiples(lowest, highest, step):
         line = from_ra_dec(ra + around * fine, np.full(240, value))
-        _draw_line(pen, view, line, f"{value:+g}°")
+        _draw_line(pen, found, line, f"{value:+g}°")
     along = np.linspace(max(lowest, -88.0), min(highest, 88.0), 240)
     for value in _multiples(ra - around, ra + around, ra_step):
         line = from_ra_dec(np.full(240, value), along)
-        _draw_line(pen, view, line, f"{value % 360.0:g}°")
+        _draw_line(pen, found, line, f"{value % 360.0:g}°")
 
 
-def _draw_line(pen: _Pen, view: SkyView, line: Vector, text: str) -> None:
-    u, v = view.places(line @ view.attitude.T)
+def _draw_line(pen: _Pen, found: PictureAttitude, line: Vector, text: str) -> None:
+    u, v = found.lens.places(line @ found.lens_attitude.T)
     seen = np.isfinite(u) & np.isfinite(v)
     x, y = (u + 0.5) * pen.scale, (v + 0.5) * pen.scale
     width, height = pen.size
@@ -175,15 +150,14 @@ def _draw_line(pen: _Pen, view: SkyView, line: Vector, text: str) -> None:
     points = [(float(a), float(b)) for a, b in zip(x[near & seen], y[near & seen], strict=True)]
     if len(points) > 1:
         pen.draw.line(points, fill=_GRID)
-        # The label stands where the line enters the picture, well inside.
+        # Where the line comes in, well inside.
         k = int(np.flatnonzero(inside)[min(3, int(inside.sum()) - 1)]) if inside.any() else -1
         if k >= 0:
             pen.label(float(u[k]), float(v[k]), text, 2.0, _GRID)
 
 
-def _draw_scale(pen: _Pen, view: SkyView) -> None:
+def _draw_scale(pen: _Pen, width_deg: float) -> None:
     """Draw a scale bar of a round angle at the lower left."""
-    width_deg = view.field_deg[0]
     angle = max((each for each in STEPS_DEG if each <= width_deg / 4.0), default=STEPS_DEG[0])
     length = (
         pen.size[0] * math.tan(math.radians(angle / 2.0)) / math.tan(math.radians(width_deg / 2.0))

@@ -15,7 +15,7 @@ from service.imaging.frames.files import read_frame
 from service.imaging.frames.frame import Frame, FrameLimits
 from service.sky.catalog.star_catalog import load_embedded
 from service.vectors import attitude_error_arcsec
-from tests.pictures.drawn import draw_picture, middle_attitude
+from tests.features.pictures.drawn import draw_picture, middle_attitude
 
 LIMITS = FrameLimits(10_000_000)
 

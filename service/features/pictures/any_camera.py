@@ -2,13 +2,16 @@
 
 import json
 import sys
-from argparse import Namespace
+from argparse import ArgumentParser, Namespace
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from msgspec import to_builtins
 
+from service.cli.arguments import degrees, describe, positive, settings_of
+from service.cli.commands.frame import SIDECAR
+from service.cli.commands.frame import run as submit_frames
 from service.errors import BadInput, Fault, printable, shown_value
 from service.settings import Settings
 
@@ -23,10 +26,53 @@ LEAST_MEGAPIXELS = 64
 """Least limit in megapixels for pictures on this computer, higher than for uploads."""
 
 
+def extend(parser: ArgumentParser) -> None:
+    """Let `acquire frame` take pictures without a spacecraft, with options for their lens."""
+    describe(parser, run, SIDECAR)
+    lens = parser.add_argument_group(
+        "without a spacecraft",
+        "known data of any camera; values of its lens may be wrong by a quarter",
+    )
+    lens.add_argument("--fov", type=degrees, metavar="DEG", help="field of view, the longer side")
+    lens.add_argument(
+        "--lens",
+        choices=("gnomonic", "equidistant", "equisolid", "stereographic"),
+        help="projection: gnomonic (on a plane) or of a fisheye; default: whatever fits",
+    )
+    lens.add_argument("--focal-px", type=positive, metavar="PX", help="focal length in pixels")
+    lens.add_argument("--focal-mm", type=positive, metavar="MM", help="with --pixel-um")
+    lens.add_argument("--pixel-um", type=positive, metavar="UM", help="the pitch of the pixels")
+    lens.add_argument(
+        "--dark", type=Path, metavar="FILE", help="a frame of the same exposure without light"
+    )
+
+
+def run(parsed: Namespace) -> int:
+    """Detect the stars in frames and pictures (FITS, TIFF, PNG, JPEG, GIF, BMP, PGM, raw, .npy),
+    identify them and solve for the attitude.  Frames of a spacecraft are recorded; one that is
+    sent again returns the first answer.  Without a spacecraft a picture may be from any camera:
+    its lens is fitted with the attitude, nothing is recorded, and the overlay is FILE-stars.png.
+
+    acquire frame holiday.jpg                    any camera, any lens
+    acquire frame holiday.jpg --focal-mm 50 --pixel-um 4.8 --overlay stars.png
+    acquire frame frames/*.fits --spacecraft IMAGER --overlay pictures/
+    acquire frame one.fits --spacecraft IMAGER --in-process --overlay one.png
+    acquire frame one.png --spacecraft IMAGER --time 2026-03-01T00:00:00Z --json
+    """
+    if parsed.spacecraft is None:
+        return solve_pictures(parsed, settings_of(parsed))
+    for name in ("fov", "lens", "focal_px", "focal_mm", "pixel_um", "dark"):
+        value = getattr(parsed, name)
+        if value is not None:
+            message = "goes without --spacecraft; a mission's file describes its camera"
+            raise BadInput(Fault(f"--{name.replace('_', '-')}", message, shown_value(str(value))))
+    return submit_frames(parsed)
+
+
 def solve_pictures(parsed: Namespace, settings: Settings) -> int:
     """Solve each picture file and print its result; returns 1 if any fails, otherwise 0."""
     from service.acquire.picture import blind_sky, solve_picture
-    from service.contract.pictures import picture_of
+    from service.features.pictures.records import picture_of
     from service.sky.catalog.star_catalog import open_catalog
 
     sky, solver = blind_sky(open_catalog(settings.catalog))
@@ -155,7 +201,7 @@ def _matched(report: dict[str, Any]) -> str:
 
 
 def _write_overlay(parsed: Namespace, file: Path, result: "PictureResult") -> Path:
-    from service.acquire.picture import overlay_of
+    from service.features.pictures.overlay import overlay_of
 
     target: Path = parsed.overlay or Path(f"{file.stem}-stars.png")
     if parsed.overlay is not None and (len(parsed.files) > 1 or target.is_dir()):

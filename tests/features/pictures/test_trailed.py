@@ -15,8 +15,8 @@ from service.imaging.frames.files import read_frame
 from service.imaging.frames.frame import FrameLimits
 from service.sky.catalog.star_catalog import load_embedded
 from service.vectors import ARCSEC_PER_RADIAN, attitude_error_arcsec
-from tests.pictures.drawn import middle_attitude
-from tests.pictures.trailed import draw_trailed
+from tests.features.pictures.drawn import middle_attitude
+from tests.features.pictures.trailed import draw_trailed
 from tests.scale import draws
 
 LENS = Lens(1200, 800, focal_px_of(1200, 40.0))

@@ -1,0 +1,11 @@
+"""`acquire frame` without a spacecraft, and `acquire camera`."""
+
+from typing import Any
+
+from service.features.pictures import any_camera, camera
+
+
+def add(commands: Any) -> None:
+    """Declare the commands."""
+    any_camera.extend(commands.choices["frame"])
+    camera.add(commands)

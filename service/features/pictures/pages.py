@@ -1,0 +1,30 @@
+"""The page of pictures."""
+
+from starlette.responses import Response
+
+from service.web.console.page import HEADERS, ContextDep, FromQuery, PageQuery, console_page
+from service.web.requests.access import Policy
+
+# The script shows the drawn picture, which no address of the service has.
+_POLICY = HEADERS["Content-Security-Policy"].replace("img-src 'self'", "img-src 'self' blob:")
+
+
+@console_page("/pictures", "Pictures", Policy("read", "nothing"), position=60)
+def pictures_page(query: FromQuery[PageQuery], context: ContextDep) -> Response:
+    """Drop a picture: its attitude, stars and lens, and what to try if there are none."""
+    missions = context.app.missions
+    cameras = [
+        (name, tracker.camera)
+        for name in context.spacecraft
+        if name in missions
+        for tracker in [each for each in missions[name].trackers if each.camera][:1]
+    ]
+    page = context.rendered(
+        "pictures.html.jinja",
+        query.run,
+        cameras=cameras,
+        most_mb=context.app.settings.frame_mb,
+        most_megapixels=context.app.settings.frame_megapixels,
+    )
+    page.headers["Content-Security-Policy"] = _POLICY
+    return page

@@ -1,0 +1,92 @@
+"""Pictures of any camera, solved one at a time without a record."""
+
+import base64
+import re
+import threading
+from typing import IO
+
+from msgspec.structs import replace
+
+from service.app.factory import App
+from service.errors import Busy
+from service.features.pictures.records import Picture, picture_of
+from service.imaging.frames.files import read_frame
+from service.imaging.frames.frame import FrameLimits
+from service.missions.mission import mission_named
+from service.vectors import Projection
+
+WAIT_S = 30.0
+"""Longest wait of a picture for its turn in seconds: others may take seconds."""
+_COMMAND_OPTION = re.compile(r" \(--[^)]*\)")
+
+
+class Pictures:
+    """Finds attitude, lens and stars of pictures, which are not recorded."""
+
+    def __init__(self, app: App) -> None:
+        self._app = app
+        self._turn = threading.BoundedSemaphore(1)
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+    def solve(
+        self,
+        file: IO[bytes],
+        *,
+        spacecraft: str | None = None,
+        field_of_view_deg: float | None = None,
+        projection: Projection | None = None,
+        image: str | None = None,
+        draws: bool = False,
+    ) -> Picture:
+        """Solve the attitude and the lens of a picture from any camera; nothing is recorded.
+
+        With a `spacecraft` the picture must have the size of its camera's frames, whose focal
+        length is the first guess.  The file is closed at the end.  One picture is solved at a
+        time.  Raises `Busy` if others take too long, `NotFound` for an unknown spacecraft, and
+        `BadInput` for a file that is no picture.
+        """
+        self._app.submissions.require_kernels()
+        # Imported here, since the import takes a third of the service's starting time.
+        from service.acquire.picture import blind_sky, solve_picture
+        from service.acquire.picture_remarks import doubt_of_exposure
+        from service.features.pictures.overlay import overlay_of
+        from service.identify.blind.solver import focal_px_of
+
+        with file:
+            shape, guess_px, zero_point_mag = None, None, None
+            if spacecraft is not None:
+                mission = mission_named(self._app.missions, spacecraft)
+                _, camera = mission.camera_tracker(None, "spacecraft")
+                shape, guess_px = camera.shape, camera.focal_length_px
+                zero_point_mag = camera.zero_point_mag
+            max_pixels = self._app.settings.frame_megapixels * 1_000_000
+            limits = FrameLimits(max_pixels, shape, spacecraft or "the camera", image)
+            if not self._turn.acquire(timeout=WAIT_S):
+                raise Busy("other pictures are being solved", 10)
+            try:
+                frame = read_frame(file, limits)
+                if field_of_view_deg is not None:
+                    side_px = max(frame.width_px, frame.height_px)
+                    guess_px = focal_px_of(side_px, field_of_view_deg, projection or "gnomonic")
+                sky, solver = blind_sky(self._app.sky.catalog)
+                result = solve_picture(frame, sky, solver, guess_px, projection=projection)
+                drawn = overlay_of(result, "") if draws else None
+            finally:
+                self._turn.release()
+        found = picture_of(result)
+        return replace(
+            found,
+            # Remarks name options of the command.
+            remarks=[
+                *(_COMMAND_OPTION.sub("", remark) for remark in found.remarks),
+                *doubt_of_exposure(result, zero_point_mag),
+            ],
+            overlay_png=base64.b64encode(drawn).decode() if drawn is not None else None,
+        )
+
+
+def open_part(app: App) -> Pictures:
+    """The pictures of an open application."""
+    return Pictures(app)
