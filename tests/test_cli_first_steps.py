@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from service.advice.zone_census import axes_deg, zone_censuses, zone_counts
 from service.cli import build_parser
 from service.cli.arguments import Parser
+from service.mission_checks.zone_census import axes_deg, zone_censuses, zone_counts
 from service.missions.mission import SHIPPED_FOLDER
 from service.sky.zones import SearchRegion, build_zone
 from service.times import parse_utc

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from service.advice.zone_census import ZoneCensus, axes_deg
+from service.mission_checks.zone_census import ZoneCensus, axes_deg
 from service.vectors import Vector, from_ra_dec, to_ra_dec, unit
 
 if TYPE_CHECKING:

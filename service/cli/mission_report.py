@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from service.advice.intervals import wilson
-from service.advice.mission_check import (
+from service.errors import BadInput, Fault, shown_value
+from service.intervals import wilson
+from service.mission_checks.mission_check import (
     FEW_STARS,
     Finding,
     TrackerView,
@@ -17,8 +18,7 @@ from service.advice.mission_check import (
     findings,
     tracker_views,
 )
-from service.advice.zone_census import ZoneCensus, axes_deg, zone_censuses
-from service.errors import BadInput, Fault, shown_value
+from service.mission_checks.zone_census import ZoneCensus, axes_deg, zone_censuses
 from service.sky.catalog.run_catalog import RunCatalog, build_run_catalog
 from service.times import FIRST_YEAR, LAST_YEAR, parse_utc, utc_now
 

@@ -13,9 +13,9 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from service.advice.intervals import Interval
 from service.cli.tables import markdown
 from service.errors import BadInput, Fault, shown_value
+from service.intervals import Interval
 from studies.documents import pictures_in
 from studies.mission_rates.simulation import OUTCOMES, Plan, Rates, sigobs_arcsec
 

@@ -20,8 +20,8 @@ from tqdm import tqdm
 
 from service.acquire import BatchColumns, acquire_many
 from service.acquire.choices import idle_reason
-from service.advice.intervals import Interval, share_of
 from service.errors import BadInput, Fault, shown_value
+from service.intervals import Interval, share_of
 from service.missions.mission import Band, Identifier, Mission, Tolerances
 from service.simulate.motion import random_axis, tilted
 from service.sky.cache import LruCache

@@ -162,9 +162,9 @@ What differs from the paper:
   arcseconds, as the service keeps them;
 - Table 4: fields are lists of stars with Gaussian errors of position; no image is drawn;
 - real pictures (section 4, to come): told the focal length, with the sixteen brightest points and
-  stars to V 7, `ptp` finds the attitude of two of the three pictures in `tests/features/pictures`, and none
-  of the one where a tree covers the sky (`tests/identify/test_ptp_pipeline.py`); the solver for
-  pictures of any camera solves all three ([cameras.md](cameras.md)).
+  stars to V 7, `ptp` finds the attitude of two of the three pictures in `tests/features/pictures`,
+  and none of the one where a tree covers the sky (`tests/identify/test_ptp_pipeline.py`); the
+  solver for pictures of any camera solves all three ([cameras.md](cameras.md)).
 
 The attitude check is ours and replaces the validation, because sharing stars accept fields that are
 none: sides are the same in a mirror, so that they accept a mirrored sky nearly always, and at two

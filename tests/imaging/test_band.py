@@ -12,13 +12,13 @@ import pytest
 from pydantic import ValidationError
 
 from service.acquire import acquire
-from service.advice.mission_check import findings
 from service.imaging.centroids.psf import ColouredPsf, airy_psf
 from service.imaging.centroids.shape_fit import fit_in_its_colour
 from service.imaging.centroids.window import Detector, Window
 from service.imaging.detection.star_images import AIRY_OVER_SIGMA, psfs_of_colours, still_psf
 from service.imaging.frames.files import frame_digest
 from service.imaging.submit import read_known, submission_of_frame
+from service.mission_checks.mission_check import findings
 from service.missions.camera import Camera
 from service.simulate.frames import FrameSettings, draw_frames, frame_bytes
 from service.vectors import attitude_error_arcsec, matrix_from_quaternion

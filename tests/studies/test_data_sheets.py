@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from service.acquire import acquire
-from service.advice.intervals import share_of
+from service.intervals import share_of
 from service.missions.mission import parse_mission
 from service.observations.schema import submission_from_json
 from service.simulate.stretches import NO_TROUBLES, Pass

@@ -11,7 +11,7 @@ from service.cli import arguments
 from service.errors import BadConfiguration, BadInput, Fault, shown_value
 
 if TYPE_CHECKING:
-    from service.advice.zone_size import ZoneEstimate
+    from service.mission_checks.zone_estimate import ZoneEstimate
     from service.missions.mission import Mission
 
 
@@ -214,8 +214,8 @@ def estimate(parsed: Namespace) -> int:
     acquire mission estimate XTE --size 6 8 10.66 15
     acquire mission estimate SOHO --magnitude-limit 7 8 --pair-separation-max 2 4 --json
     """
-    from service.advice.zone_size import neighbours_of, zone_estimates
     from service.cli.mission_report import epoch_of
+    from service.mission_checks.zone_estimate import neighbours_of, zone_estimates
     from service.settings import Settings
     from service.sky.catalog.run_catalog import build_run_catalog
     from service.sky.catalog.star_catalog import open_catalog

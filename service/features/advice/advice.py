@@ -14,12 +14,12 @@ import numpy as np
 from msgspec import structs
 
 from service.acquire import Acquisition
-from service.advice.intervals import Z95, Interval
 from service.errors import BadInput
 from service.features.advice import trackers
 from service.features.advice.evidence import evidence_of, merged
 from service.features.advice.tolerances import ToleranceFinding, tolerance_findings
 from service.identify.identification import Identification
+from service.intervals import Z95, Interval
 from service.missions.mission import Band, Identifier, Mission
 from service.observations.batch import ObservationBatch
 

@@ -13,9 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from service.acquire.choices import aberration_velocity
-from service.advice.intervals import Interval, share_of
 from service.contract.answers import Answer
 from service.features.advice.records import Cause
+from service.intervals import Interval, share_of
 from service.missions.mission import Band, Mission
 from service.observations.batch import ObservationBatch
 from service.observations.calibrate import CorrectedObservations, correct

@@ -27,10 +27,10 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from service.advice.intervals import Interval
 from service.attitude.definitive import MeasuredInnovations, Outcome
 from service.features.advice.statements import FileChange, Statement
 from service.features.advice.trackers import NoiseFinding
+from service.intervals import Interval
 from service.missions.mission import Mission
 from service.missions.motion import GyroSettings
 from service.vectors import Vector, full_matrices

@@ -9,10 +9,8 @@ from functools import partial
 
 from service.acquire import Acquisition
 from service.acquire.choices import idle_reason
-from service.advice.intervals import Interval
 from service.app.context import Context
 from service.app.factory import App
-from service.app.zones import Zones
 from service.errors import BadInput, Busy, Fault
 from service.features.advice import records
 from service.features.advice.advice import Findings, VariantOutcome, WorkLimit, advise
@@ -38,17 +36,21 @@ from service.features.advice.trackers import (
     NoiseFinding,
     NoisePeriod,
 )
+from service.features.advice.zone_size import ZoneCost, ZoneSize, zone_cost, zone_size
 from service.ingest.submit import SubmissionService
+from service.intervals import Interval
 from service.missions.mission import Mission
 from service.observations.batch import ObservationBatch
 from service.observations.schema import TolerancesIn
+from service.sky.catalog.run_catalog import RunCatalog
 from service.storage.queries.definitive import latest_innovations
-from service.storage.queries.pages import ResultFilter
+from service.storage.queries.pages import ResultFilter, latest_time
 from service.storage.queries.period import sample_period
 from service.storage.queries.results import BatchSample, sample_batches
 from service.storage.queries.time_buckets import BucketFilter
+from service.storage.queries.trends import latest_prior_errors
 from service.storage.recording.unsaved_result import LIVE
-from service.times import DAY_S, Utc, recorded_utc, shifted
+from service.times import DAY_S, Utc, recorded_utc, shifted, utc_now
 
 ADVICE_SAMPLE = 200
 """Default number of batches for advice: sigma accurate to about 5 %, processed in seconds."""
@@ -76,12 +78,53 @@ class Ambiguity:
         return round(self.parts[0].stars * self.parts[0].share.value)
 
 
+MOST_ERRORS = 10_000
+MOST_COSTS = 1_000
+
+
+class ZoneSizes:
+    """Advice on the sizes of zones from recorded a priori errors; it keeps the costs of sizes."""
+
+    def __init__(self, context: Context) -> None:
+        self._context = context
+        self._costs: dict[tuple[str, str, float], ZoneCost] = {}
+
+    def advised(self, name: str, run: str | None) -> tuple[ZoneSize, list[ZoneCost]]:
+        """Advice on the size of a spacecraft's zone by a run's a priori errors.
+
+        The errors are those of the latest `MOST_ERRORS` batches; a batch without an attitude
+        has none.  The costs are those of the sizes, where another size is advised.
+        """
+        size, cost_of = self._size(name, run)
+        changes = size.verdict in ("too_small", "larger_than_needed")
+        return size, [cost_of(each) for each in size.sizes_deg] if changes else []
+
+    def _size(self, name: str, run: str | None) -> tuple[ZoneSize, Callable[[float], ZoneCost]]:
+        mission = self._context.mission(name)
+        place = ResultFilter(run or LIVE, name)
+        with self._context.reading_record() as connection:
+            time = latest_time(connection, place, utc_now())
+            angles_deg, sigmas_deg = latest_prior_errors(connection, place, MOST_ERRORS)
+        run_catalog = self._context.sky.run_catalog(mission, time or utc_now())
+        size = zone_size(mission, angles_deg, sigmas_deg)
+        return size, partial(self._cost, mission, run_catalog)
+
+    def _cost(self, mission: Mission, run_catalog: RunCatalog, size_deg: float) -> ZoneCost:
+        """The cost of a zone of this size; searching the whole sky takes up to seconds."""
+        key = mission.digest, run_catalog.digest, size_deg
+        if key not in self._costs:
+            if len(self._costs) >= MOST_COSTS:
+                self._costs.clear()
+            self._costs[key] = zone_cost(mission, run_catalog.direction, size_deg)
+        return self._costs[key]
+
+
 class AdviceService:
     """Computes advice on mission settings, for one caller at a time."""
 
-    def __init__(self, context: Context, submissions: SubmissionService, zones: Zones) -> None:
+    def __init__(self, context: Context, submissions: SubmissionService) -> None:
         self._context = context
-        self._zones = zones
+        self._zone_sizes = ZoneSizes(context)
         self._submissions = submissions
         self._lock = threading.Lock()
 
@@ -153,7 +196,7 @@ class AdviceService:
             findings = advise(
                 mission, drawn.batches, run_again, run_freely, own, pace, self._run_with
             )
-            zone = zone_statements(mission, *self._zones.advised_size(name, run))
+            zone = zone_statements(mission, *self._zone_sizes.advised(name, run))
         finally:
             self._lock.release()
         noise = innovation_findings(innovation_noise(met), mission, findings.noise)
@@ -380,4 +423,4 @@ def best_setting(advice: records.Advice) -> tuple[records.Trial, records.Trial] 
 
 def open_part(app: App) -> AdviceService:
     """Create the advice service for an open app."""
-    return AdviceService(app.context, app.submissions, app.zones)
+    return AdviceService(app.context, app.submissions)

@@ -5,9 +5,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from service.advice.intervals import Interval
-from service.advice.zone_size import LEAST_BATCHES as LEAST_BATCHES_OF_ZONES
-from service.advice.zone_size import ZoneCost, ZoneSize
 from service.features.advice.advice import ALL_RECOMMENDED, PRESENT, Findings, VariantOutcome
 from service.features.advice.tolerances import (
     KEPT,
@@ -16,6 +13,9 @@ from service.features.advice.tolerances import (
     ToleranceFinding,
 )
 from service.features.advice.trackers import AlignmentFinding, MagnitudeFinding, NoiseFinding
+from service.features.advice.zone_size import LEAST_BATCHES as LEAST_BATCHES_OF_ZONES
+from service.features.advice.zone_size import ZoneCost, ZoneSize
+from service.intervals import Interval
 from service.missions.mission import Band, Mission
 
 Action = Literal["widen", "tighten", "keep", "correct", "wait"]

@@ -13,8 +13,8 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from service.advice.intervals import Interval, quantile, share_of
 from service.features.advice.evidence import Evidence
+from service.intervals import Interval, quantile, share_of
 from service.missions.mission import Band, Mission
 from service.vectors import Vector
 

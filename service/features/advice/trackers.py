@@ -7,8 +7,8 @@ from typing import Literal
 import numpy as np
 
 from service import vectors
-from service.advice.intervals import Interval, intervals, median, quantile, robust_fit
 from service.features.advice.evidence import Evidence, StarEvidence, TrackerAttitude
+from service.intervals import Interval, intervals, median, quantile, robust_fit
 from service.missions.mission import Mission, Tracker
 from service.times import Utc
 

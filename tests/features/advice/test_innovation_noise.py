@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.advice.intervals import Interval
 from service.features.advice.innovations import (
     LEAST,
     InnovationNoise,
@@ -19,6 +18,7 @@ from service.features.definitive.kernels.filter import filter_attitude
 from service.features.definitive.kernels.inputs import AttitudeMeasurements
 from service.features.definitive.kernels.smoother import smooth
 from service.gyro.samples import GyroModel
+from service.intervals import Interval
 from tests.features.definitive.passes import GYRO, mission_with
 from tests.features.definitive.simulated import attitudes_of, gyro_of, slews, truth_of
 from tests.missions.without_gyro import mission_without_gyro

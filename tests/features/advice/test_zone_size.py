@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from service.advice.zone_census import zone_censuses
-from service.advice.zone_size import ZoneCost, geometric_k_g, zone_cost, zone_size
 from service.features.advice.statements import zone_statements
+from service.features.advice.zone_size import ZoneCost, zone_cost, zone_size
+from service.mission_checks.zone_census import zone_censuses
+from service.mission_checks.zone_estimate import geometric_k_g
 from service.sky.catalog.run_catalog import build_run_catalog
 from service.times import parse_utc
 

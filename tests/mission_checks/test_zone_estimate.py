@@ -5,8 +5,14 @@ import json
 import numpy as np
 import pytest
 
-from service.advice.zone_census import zone_censuses, zone_counts
-from service.advice.zone_size import neighbours_of, predicted, shape_of, zone_bytes, zone_estimates
+from service.mission_checks.zone_census import zone_censuses, zone_counts
+from service.mission_checks.zone_estimate import (
+    neighbours_of,
+    predicted,
+    shape_of,
+    zone_bytes,
+    zone_estimates,
+)
 from service.missions.mission import SHIPPED_FOLDER
 from service.simulate.motion import random_axis
 from service.sky.zones import SearchRegion, build_zone

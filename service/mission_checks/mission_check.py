@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from service.acquire.choices import idle_reason
-from service.advice import zone_census
+from service.mission_checks import zone_census
 from service.missions.mission import Band, Mission, Tracker
 from service.missions.scan import Raster, Sweep
 from service.sky.catalog.run_catalog import RunCatalog

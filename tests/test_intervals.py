@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from service.advice import intervals
+from service import intervals
 
 TRIALS = 2000
 LEAST_COVERED = 0.90

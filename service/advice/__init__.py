@@ -1,1 +1,0 @@
-"""Advice on missions: zone sizes, checks of mission files, intervals of estimates."""

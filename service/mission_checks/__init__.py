@@ -1,0 +1,1 @@
+"""Checks of a mission file: its settings, and the stars and pairs of its zones."""
