@@ -13,6 +13,7 @@ a client that holds many open connections cannot keep others out.
 import asyncio
 import ipaddress
 import json
+import logging
 import time
 from collections import OrderedDict
 from collections.abc import Iterable
@@ -21,7 +22,6 @@ from http import HTTPStatus
 from typing import Any, Protocol, cast
 
 import uvicorn
-from uvicorn._types import ASGI3Application
 from uvicorn.protocols.http.flow_control import FlowControl
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol, RequestResponseCycle
 from uvicorn.server import ServerState
@@ -199,6 +199,10 @@ DISCARDING_SHARE = 0.1
 """The share of the event loop's time that such bodies may take: small chunks are expensive."""
 LEAST_PAUSE_S = 0.005
 
+_LOG = logging.getLogger("uvicorn.error.connections")
+# A warning for each request that is none, or asks for WebSockets, would fill the log.
+_LOG.setLevel(logging.ERROR)
+
 
 class SharedState(ServerState):
     """State that the connections of a server share."""
@@ -265,6 +269,7 @@ class _Flow(FlowControl):
 
     def __init__(self, transport: asyncio.Transport) -> None:
         super().__init__(transport)
+        self.transport = transport
         self._on_hold = False
         self._stopped = False
 
@@ -282,13 +287,13 @@ class _Flow(FlowControl):
 
     def _apply(self) -> None:
         stop = self.read_paused or self._on_hold
-        if stop == self._stopped or self._transport.is_closing():
+        if stop == self._stopped or self.transport.is_closing():
             return
         self._stopped = stop
         if stop:
-            self._transport.pause_reading()
+            self.transport.pause_reading()
         else:
-            self._transport.resume_reading()
+            self.transport.resume_reading()
 
 
 class _Http(HttpToolsProtocol):
@@ -307,8 +312,6 @@ class _Http(HttpToolsProtocol):
     _is_over = False
     """Nothing that still arrives is looked at."""
     _answering: RequestResponseCycle | None = None
-    _in_pipeline = False
-    """True if the request that begins has waited behind another one."""
     _in_body = False
     _section_bytes = _fields = 0
     """The size of the head or the trailers, as far as the parser has reported them."""
@@ -317,6 +320,10 @@ class _Http(HttpToolsProtocol):
     _body_bytes = _framing_bytes = 0
 
     # ---- the connection ------------------------------------------------------------------------
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self.logger = _LOG
 
     # uvicorn narrows what asyncio's protocol takes, and ignores that as well.
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
@@ -414,7 +421,11 @@ class _Http(HttpToolsProtocol):
         if refusal is not None:
             self._refuse(_raw_response(*refusal))
             return
+        before: RequestResponseCycle | None = self.cycle
+        is_next = before is None or before.response_complete
         super().on_headers_complete()
+        if is_next:
+            self._answering = self.cycle
         self._no_head_since_s = None
         self._in_body = True
         self._section_bytes = self._fields = self._body_bytes = self._framing_bytes = 0
@@ -435,23 +446,14 @@ class _Http(HttpToolsProtocol):
             super().on_message_complete()
 
     def on_response_complete(self) -> None:
-        self._in_pipeline = True
+        if self.pipeline:
+            # The next begins after a pause, in which nothing is read either.
+            self._answering, _ = self.pipeline[-1]
+            self.loop.call_later(PIPELINED_PAUSE_S, super().on_response_complete)
+            return
         super().on_response_complete()
-        self._in_pipeline = False
-        # Of a pipelined request the head is there already.
-        if self.cycle.response_complete:
-            self._no_head_since_s = self.loop.time()
-            self.admission.set_idle(self)
-
-    def _start_asgi_task(self, cycle: RequestResponseCycle, app: ASGI3Application) -> None:
-        self._answering = cycle
-        if self._in_pipeline:
-            self.loop.call_later(PIPELINED_PAUSE_S, super()._start_asgi_task, cycle, app)
-        else:
-            super()._start_asgi_task(cycle, app)
-
-    def _unsupported_upgrade_warning(self) -> None:
-        """Answer a request to upgrade as any other; a warning each time would fill the log."""
+        self._no_head_since_s = self.loop.time()
+        self.admission.set_idle(self)
 
     def send_400_response(self, msg: str) -> None:
         if not self._is_over:
