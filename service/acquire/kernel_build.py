@@ -170,29 +170,23 @@ def _is_complete() -> bool:
         return False
 
 
-def end_with_parent(stop: connection.Connection | None = None) -> None:
-    """Ignore, in a child process, the signals that stop the parent, and exit when it has ended.
-
-    Or when the other end of `stop` is closed.
-    """
+def end_with_parent() -> None:
+    """Ignore, in a child process, the signals that stop the parent, and exit when it has ended."""
     for each in SIGNALS:
         signal.signal(each, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
-    exit_after_parent(stop)
+    exit_after_parent()
 
 
-def exit_after_parent(stop: connection.Connection | None = None) -> None:
-    """Exit, in a child process, when the parent has ended or the other end of `stop` is closed."""
+def exit_after_parent() -> None:
+    """Exit, in a child process, when the parent has ended."""
     parent = multiprocessing.parent_process()
     assert parent is not None
-    ends: list[int | connection.Connection] = [parent.sentinel]
-    if stop is not None:
-        ends.append(stop)
-    threading.Thread(target=_exit_after, args=(ends,), daemon=True).start()
+    threading.Thread(target=_exit_after, args=(parent.sentinel,), daemon=True).start()
 
 
-def _exit_after(ends: "list[int | connection.Connection]") -> None:
-    connection.wait(ends)
+def _exit_after(sentinel: int) -> None:
+    connection.wait([sentinel])
     os._exit(1)
 
 

@@ -1,29 +1,29 @@
-"""Pool of local processes that compute chunks of long work, on the standard executor.
+"""Pool of local processes that compute chunks of long work.
 
-Each process has its own missions and sky and never sees the database.  A dead child breaks a whole
-executor: a new one replaces it and gets the unfinished chunks again, one at a time, so that a chunk
-that kills its process can be named.
+Each has missions and a sky of its own and never sees the database.  It has a connection of its
+own, over which it computes chunks in the order in which they come: the chunk that a process died
+over is known, and costs no other.  One thread hands out chunks, takes results, and replaces the
+processes that died.
 
-The processes are forked from the standard library's fork server, which has imported the modules
-once and does nothing else: no thread, no database, no kernel.
+The processes are forked from the standard library's fork server, which has imported the
+modules once and does nothing else: no thread, no database, no kernel.
 """
 
+import atexit
 import logging
 import multiprocessing
-import multiprocessing.connection
-import os
 import pickle
 import signal
 import threading
 import time
 from collections import deque
-from concurrent.futures import Future, InvalidStateError, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable
+from concurrent.futures import Future, InvalidStateError
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import partial
 from multiprocessing import forkserver, resource_tracker, util
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import ForkServerProcess
 from typing import Any, Generic, TypeVar
 
 from service import logs
@@ -31,18 +31,20 @@ from service.acquire.kernel_build import SIGNALS
 from service.child_processes import safe_path
 from service.errors import Stopping
 from service.ingest import worker_process
-from service.ingest.worker_process import Work, WorkerConfig, begin, compute, ready_pid
+from service.ingest.worker_process import Work, WorkerConfig, serve
 
 PAUSE_S, LONGEST_PAUSE_S = 1.0, 60.0
-"""First and longest pause in seconds before dead processes are replaced; it doubles each time."""
+"""First and longest pause in seconds after early deaths of processes; it doubles each time."""
 IDLE_S = 600.0
 """Seconds without a chunk after which the processes end, to free their memory."""
 MOST_STARTS = 3
-"""Maximum number of process starts for one chunk, when each process dies before receiving it."""
+"""Number of processes in a row that die before they are ready until waiting chunks fail."""
 SERVER_RETRY_S, SERVER_GONE_S = 0.1, 10.0
 """Interval and time limit, in seconds, for new starts while the fork server is ending."""
-MOST_DEATHS = 2
-"""Number of processes that die with one chunk alone at work before that chunk is given up."""
+MOST_DEATHS = 3
+"""Number of processes that die while they compute one chunk before it is given up."""
+AT_HAND = 2
+"""Number of chunks sent to a process: the one that it computes, and the next."""
 
 log = logging.getLogger(__name__)
 
@@ -59,31 +61,48 @@ class ChunkEndsWorkers(WorkerLost):
 
 
 @dataclass(eq=False)
-class _QueuedTask(Generic[Input, Output]):
-    task: Input
-    done: "Future[list[Output]]" = field(default_factory=Future)
+class _Chunk:
+    """Chunk as it is sent, with the future of its results; `deaths` counts processes it ended."""
+
+    content: bytes
+    done: "Future[list[Any]]" = field(default_factory=Future)
     deaths: int = 0
-    """Number of processes that died while one chunk alone was at work."""
-    lost_starts: int = 0
-    """Number of processes that died before they were ready, while one chunk alone was at work."""
+
+    def fail(self, error: Exception) -> None:
+        with suppress(InvalidStateError):  # cancelled meanwhile
+            self.done.set_exception(error)
+
+    def take(self, answer: bytes) -> None:
+        """Set the future from a worker's answer: packs of results, or in words why there are none."""
+        try:
+            packs = pickle.loads(answer)
+            if isinstance(packs, str):
+                raise WorkerLost(f"a worker failed ({packs})")
+            found = [each for pack in packs for each in pickle.loads(pack)]
+        except WorkerLost as error:
+            self.fail(error)
+        except Exception as error:  # whatever the classes of the results raise
+            self.fail(WorkerLost(f"a worker's result cannot be read ({error!r})"))
+        else:
+            with suppress(InvalidStateError):
+                self.done.set_result(found)
 
 
 @dataclass(eq=False)
-class _Processes(Generic[Input, Output]):
-    """Processes of one executor, with the unfinished tasks submitted to it."""
+class _Worker:
+    """Worker process with its connection and the chunks it has not answered, oldest first."""
 
-    executor: ProcessPoolExecutor
-    stop: Connection
-    tasks: "set[_QueuedTask[Input, Output]]" = field(default_factory=set)
-    pids: set[int] = field(default_factory=set)
-    """Ids of the processes that are ready; all are, as soon as one is."""
-    is_ending: bool = False
-    _closing: threading.Lock = field(default_factory=threading.Lock)
+    process: ForkServerProcess
+    connection: Connection
+    chunks: deque[_Chunk] = field(default_factory=deque)
+    is_ready: bool = False
 
     def end(self) -> None:
-        """Tell the processes to exit by closing their pipe; may be repeated, from any thread."""
-        with self._closing:
-            self.stop.close()
+        """Kill the process and wait until it has ended."""
+        self.process.kill()
+        # A process whose server died counts as ended: it exits when its connection closes.
+        self.connection.close()
+        self.process.join()
 
 
 class LocalWorkers(Generic[Input, Output]):
@@ -92,51 +111,50 @@ class LocalWorkers(Generic[Input, Output]):
     def __init__(self, config: WorkerConfig, work: "Work[Input, Output]", count: int) -> None:
         """`work` must be a function of a module, so that a worker finds it by its name."""
         self._config, self._work, self.count = config, work, count
-        self._lock = threading.RLock()
-        self._processes: _Processes[Input, Output] | None = None
-        self._one_by_one: deque[_QueuedTask[Input, Output]] = deque()
-        """Chunks left unfinished by a broken executor, and those submitted since."""
+        self._lock = threading.Lock()
+        self._workers: list[_Worker] = []
+        self._dismissed: list[_Worker] = []
+        """Workers whose answers are ignored; the thread ends them."""
+        self._waiting: deque[_Chunk] = deque()
+        self._thread: threading.Thread | None = None
+        self._wake: Connection | None = None
+        self._is_woken = False
+        self._are_wanted = False
+        self._closing = False
+        self._early_deaths = 0
+        """Number of processes that died before they were ready, since the last that became ready."""
         self._pause_s = PAUSE_S
         self._not_before_s = 0.0
         self._used_s = 0.0
-        self._idle_check: threading.Timer | None = None
-        self._closing = False
 
     @property
     def pids(self) -> frozenset[int]:
         """Ids of the processes that are ready to work."""
         with self._lock:
-            return frozenset(self._processes.pids if self._processes else ())
+            return frozenset(each.process.pid or 0 for each in self._workers if each.is_ready)
 
     @property
     def up(self) -> int:
         """Number of processes that are ready to work."""
-        processes = self._processes
-        return len(processes.pids) if processes else 0
+        return len(self.pids)
 
     def start(self) -> None:
         """Start the worker processes unless they are running; returns at once."""
         with self._lock:
             self._used_s = time.monotonic()
-            too_soon = self._used_s < self._not_before_s
-            if self._processes is None and self.count and not (self._closing or too_soon):
-                try:
-                    self._open()
-                except OSError as error:
-                    log.warning("no process that computes chunks can be started: %s", error)
-                    self._pause()
+            if self._used_s >= self._not_before_s and len(self._workers) < self.count:
+                self._are_wanted = True
+                self._wake_thread()
 
     def submit(self, task: Input) -> "Future[list[Output]]":
         """Queue a task; the future gives its results, or raises `WorkerLost` or `Stopping`."""
-        chunk: _QueuedTask[Input, Output] = _QueuedTask(task)
+        chunk = _Chunk(pickle.dumps(task, pickle.HIGHEST_PROTOCOL))
         with self._lock:
             if self._closing:
                 raise Stopping("the service is stopping")
             self._used_s = time.monotonic()
-            if self._one_by_one:
-                self._one_by_one.append(chunk)
-            else:
-                self._hand_in(chunk)
+            self._waiting.append(chunk)
+            self._wake_thread()
         return chunk.done
 
     def restart(self) -> None:
@@ -145,253 +163,233 @@ class LocalWorkers(Generic[Input, Output]):
         Their unfinished tasks are computed again.
         """
         with self._lock:
-            processes = self._end_processes()
-        if processes is not None:
-            # Release the lock first: the executor's threads may wait for it.
-            processes.executor.shutdown(wait=False)
+            self._dismiss()
 
     def close(self) -> None:
         """End the processes at once, even during a computation."""
         with self._lock:
             self._closing = True
-            processes = self._end_processes()
-            left, self._one_by_one = list(self._one_by_one), deque()
-        if processes is not None:
-            # Release the lock first: the executor's threads may wait for it.
-            processes.executor.shutdown(cancel_futures=True)
-            with self._lock:
-                left += processes.tasks
+            self._dismiss()
+            left, self._waiting = self._waiting, deque()
+        if self._thread is not None:
+            self._thread.join()
+            atexit.unregister(self.close)
         for chunk in left:
-            _fail(chunk, Stopping("the service is stopping"))
+            chunk.fail(Stopping("the service is stopping"))
 
     # ---- with the lock held ------------------------------------------------------------------
 
-    def _open(self) -> "_Processes[Input, Output]":
-        """Start the processes with a safe import path; raises `OSError` on failure."""
-        with safe_path():
-            return self._start()
-
-    def _start(self) -> "_Processes[Input, Output]":
-        context = multiprocessing.get_context("forkserver")
-        context.set_forkserver_preload([worker_process.__name__])
-        # Python 3.11.0 would let every local user connect to the server.
-        util.abstract_sockets_supported = False  # type: ignore[misc]
-        receiver, stop = context.Pipe(duplex=False)
-        executor = ProcessPoolExecutor(
-            self.count,
-            context,
-            begin,
-            (self._config, receiver, context.Barrier(self.count), logs.configured()),
-        )
-        processes = self._processes = _Processes(executor, stop)
-        ready: list[Future[int]] = []
-        try:
-            resource_tracker.ensure_running()  # it would unblock the signals
-            # Start the processes now, and their server, unless it runs.  The server keeps the
-            # signals blocked; each process unblocks them only after it ignores them.
-            before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+    def _wake_thread(self) -> None:
+        """Wake the supervising thread; starts it, unless there is nothing to do."""
+        if self._wake is not None:
+            if not self._is_woken:
+                self._is_woken = True
+                self._wake.send_bytes(b"")
+        elif self.count and not self._closing and (self._waiting or self._are_wanted):
+            woken, wake = multiprocessing.Pipe(duplex=False)
+            thread = threading.Thread(
+                target=self._supervise, args=(woken, wake), name="worker-supervisor", daemon=True
+            )
             try:
-                forkserver.ensure_running()
-                ready.extend(executor.submit(ready_pid) for _ in range(self.count))
-            except BrokenProcessPool:
-                # A process has died already; `_see_the_end` will notice as well.
-                pass
-            finally:
-                signal.pthread_sigmask(signal.SIG_SETMASK, before)
-            self._watch(processes)
-        except (OSError, RuntimeError) as error:
-            # A thread that cannot be started raises RuntimeError.
-            self._end_processes()
-            executor.shutdown(wait=False)
-            raise OSError(f"{error}") from error
-        self._check_idle_after(IDLE_S)
-        for each in ready:
-            each.add_done_callback(partial(self._note_ready, processes))
-        return processes
+                thread.start()
+            except RuntimeError as error:
+                log.warning("no process that computes chunks can be started: %s", error)
+                self._fail_waiting(f"no process can be started: {error}")
+            else:
+                self._thread, self._wake = thread, wake
+                # The standard library waits at exit for processes that it cannot stop.
+                atexit.register(self.close)
 
-    def _end_processes(self) -> "_Processes[Input, Output] | None":
-        """Tell the processes to exit; returns them, since their executor must be shut down."""
-        processes, self._processes = self._processes, None
-        if self._idle_check is not None:
-            # The timer's thread would keep this pool in memory.
-            self._idle_check.cancel()
-        if processes is not None:
-            processes.is_ending = True
-            processes.end()
-        return processes
+    def _dismiss(self) -> None:
+        """Kill the workers and put their chunks back into the queue."""
+        for worker in reversed(self._workers):
+            worker.process.kill()
+            self._waiting.extendleft(reversed(worker.chunks))
+        self._dismissed += self._workers
+        self._workers.clear()
+        self._wake_thread()
 
-    def _watch(self, processes: "_Processes[Input, Output]") -> None:
-        """Start a thread that submits unfinished tasks again after a worker process has died.
-
-        The executor would wait for the rest of a result for as long as any process can write to the
-        pipe of results.  So this process closes its own writing end, and the other workers end with
-        the dead one: the executor is broken in any case.
-        """
-        executor = processes.executor
-        executor._result_queue._writer.close()  # type: ignore[attr-defined]
-        ends = [os.dup(each.sentinel) for each in executor._processes.values()]
-        arguments = (processes, ends, executor._executor_manager_thread)
-        threading.Thread(
-            target=self._see_the_end, args=arguments, name="worker-ends", daemon=True
-        ).start()
-
-    def _hand_in(self, chunk: _QueuedTask[Input, Output]) -> None:
-        """Submit a chunk to the executor; it fails if no process stays up."""
-        reason = "processes died as soon as they were started"
-        for _ in range(MOST_STARTS):
-            try:
-                processes = self._processes or self._opened()
-            except OSError as error:
-                reason = f"no process can be started: {error}"
-                break
-            try:
-                future = processes.executor.submit(compute, self._work, chunk.task)
-            except BrokenProcessPool:
-                self._replace(processes)
-                continue
-            processes.tasks.add(chunk)
-            future.add_done_callback(partial(self._take_result, chunk, processes))
-            return
-        _fail(chunk, WorkerLost(reason))
-        self._go_on(chunk)
-
-    def _opened(self) -> "_Processes[Input, Output]":
-        """Start the processes, waiting until a dying fork server is gone."""
-        until_s = time.monotonic() + SERVER_GONE_S
-        while True:
-            try:
-                return self._open()
-            except ConnectionError:
-                # The server has died, but is not known to be dead yet.
-                if time.monotonic() > until_s:
-                    raise
-                time.sleep(SERVER_RETRY_S)
-
-    def _replace(self, broken: "_Processes[Input, Output]") -> None:
-        if self._processes is broken:
-            log.warning("a process that computed chunks has died; others are started")
-            self._processes = None
-            broken.end()
-            broken.executor.shutdown(wait=False)
+    def _fail_waiting(self, reason: str) -> None:
+        while self._waiting:
+            self._waiting.popleft().fail(WorkerLost(reason))
 
     def _pause(self) -> None:
         """Delay the next start of processes, unless a chunk needs them."""
         self._not_before_s = time.monotonic() + self._pause_s
         self._pause_s = min(2.0 * self._pause_s, LONGEST_PAUSE_S)
 
-    # ---- threads of the executor -------------------------------------------------------------
+    # ---- the thread --------------------------------------------------------------------------
 
-    def _note_ready(self, processes: "_Processes[Input, Output]", future: "Future[int]") -> None:
-        if future.cancelled() or future.exception() is not None:
-            return
+    def _supervise(self, woken: Connection, wake: Connection) -> None:
+        while not self._closing:
+            if self._need_more:
+                self._start_missing()
+            self._hand_out()
+            with self._lock:
+                workers = [*self._workers]
+            ends = [woken, *(each.connection for each in workers)]
+            sentinels = [each.process.sentinel for each in workers]
+            ready = wait([*ends, *sentinels], IDLE_S)
+            if woken in ready:
+                with self._lock:
+                    woken.recv_bytes()
+                    self._is_woken = False
+            for worker in workers:
+                if worker.connection in ready or worker.process.sentinel in ready:
+                    self._listen(worker)
+            self._dismiss_idle()
+            self._end_dismissed()
+        self._end_dismissed()
         with self._lock:
-            processes.pids.add(future.result())
-            self._pause_s = PAUSE_S
+            # Nobody wakes it any more.
+            self._is_woken = True
+            woken.close()
+            wake.close()
 
-    def _take_result(
-        self,
-        chunk: _QueuedTask[Input, Output],
-        processes: "_Processes[Input, Output]",
-        future: "Future[list[bytes]]",
-    ) -> None:
-        error = Stopping("the service is stopping") if future.cancelled() else future.exception()
-        if isinstance(error, BrokenProcessPool):
-            # The executor may hold a lock for which a thread that holds ours waits: leave the
-            # unfinished tasks to `_see_the_end`.
-            processes.end()
-            return
+    @property
+    def _need_more(self) -> bool:
         with self._lock:
-            if processes.is_ending and not self._closing:
-                # The result has outdated settings: `_see_the_end` has the chunk computed again.
-                return
-        if error is None:
-            try:
-                found = [each for pack in future.result() for each in pickle.loads(pack)]
-            except Exception as unreadable:  # whatever the classes of the results raise
-                error = unreadable
-            else:
-                with suppress(InvalidStateError):  # cancelled meanwhile
-                    chunk.done.set_result(found)
-        with self._lock:
-            processes.tasks.discard(chunk)
-        if isinstance(error, Stopping) or (error is not None and self._closing):
-            _fail(chunk, Stopping("the service is stopping"))
-        elif error is not None:
-            _fail(chunk, WorkerLost(f"a worker failed ({error!r})"))
-        self._go_on(chunk)
+            if len(self._workers) >= self.count:
+                return False
+            if not self._waiting:
+                return self._are_wanted
+            return not self._workers or time.monotonic() >= self._not_before_s
 
-    # ---- a thread for each executor ----------------------------------------------------------
-
-    def _see_the_end(
-        self, processes: "_Processes[Input, Output]", ends: list[int], manager: threading.Thread
-    ) -> None:
-        multiprocessing.connection.wait(ends)
-        for end in ends:
-            os.close(end)
-        processes.end()
-        # The manager thread fails the unfinished tasks, and waits for the processes.
-        manager.join()
+    def _start_missing(self) -> None:
         with self._lock:
-            if not (processes.pids or processes.is_ending):
-                # The processes died before they were ready: the next ones may die too.
+            self._are_wanted = False
+            missing = self.count - len(self._workers)
+        try:
+            for _ in range(missing):
+                worker = self._started()
+                with self._lock:
+                    (self._dismissed if self._closing else self._workers).append(worker)
+                    if self._closing:
+                        return
+        except (OSError, RuntimeError) as error:
+            log.warning("no process that computes chunks can be started: %s", error)
+            with self._lock:
                 self._pause()
-            self._replace(processes)
-            left = [] if self._closing else list(processes.tasks)
-            processes.tasks.difference_update(left)
-        for chunk in left:
-            self._try_again(chunk, processes)
+                if not self._workers:
+                    self._fail_waiting(f"no process can be started: {error}")
 
-    def _try_again(
-        self, chunk: _QueuedTask[Input, Output], ended: "_Processes[Input, Output]"
-    ) -> None:
+    def _started(self) -> _Worker:
+        """Start a process; retries while a fork server that died is not known to have ended."""
+        until_s = time.monotonic() + SERVER_GONE_S
+        while True:
+            try:
+                return _start(self._config, self._work)
+            except (ConnectionError, EOFError) as error:
+                # The server has died, and is not known to have done so yet.
+                if time.monotonic() > until_s or self._closing:
+                    raise OSError(f"the server of the workers has ended: {error}") from error
+                time.sleep(SERVER_RETRY_S)
+
+    def _hand_out(self) -> None:
+        """Send waiting chunks to the ready processes with the fewest chunks."""
+        while True:
+            with self._lock:
+                ready = [
+                    each for each in self._workers if each.is_ready and len(each.chunks) < AT_HAND
+                ]
+                if not (ready and self._waiting):
+                    return
+                chunk = self._waiting.popleft()
+                if chunk.done.cancelled():
+                    continue
+                worker = min(ready, key=lambda each: len(each.chunks))
+                worker.chunks.append(chunk)
+            # Without the lock, for as long as the process takes to read it.
+            with suppress(OSError):  # one that has died is heard of by its end
+                worker.connection.send_bytes(chunk.content)
+
+    def _listen(self, worker: _Worker) -> None:
+        """Read the answers of a worker, and note its end if it has died."""
+        try:
+            while worker.connection.poll():
+                answer = worker.connection.recv_bytes()
+                self._take(worker, answer)
+        except (EOFError, OSError):
+            self._see_to_death(worker)
+            return
+        if not worker.process.is_alive():
+            self._see_to_death(worker)
+
+    def _take(self, worker: _Worker, answer: bytes) -> None:
         with self._lock:
-            if self._closing:
-                _fail(chunk, Stopping("the service is stopping"))
+            if worker not in self._workers:
+                # It has the settings of before.
                 return
-            if not (self._one_by_one and self._one_by_one[0] is chunk):
-                self._one_by_one.append(chunk)
-                if len(self._one_by_one) == 1:
-                    self._hand_in(chunk)
+            if not worker.is_ready:
+                worker.is_ready = True
+                self._early_deaths, self._pause_s = 0, PAUSE_S
                 return
-            if not ended.is_ending:
-                chunk.deaths += bool(ended.pids)
-                chunk.lost_starts += not ended.pids
-            if chunk.deaths < MOST_DEATHS and chunk.lost_starts < MOST_STARTS:
-                self._hand_in(chunk)
-                return
-        if chunk.deaths >= MOST_DEATHS:
-            _fail(chunk, ChunkEndsWorkers(f"{MOST_DEATHS} processes died over it"))
-        else:
-            _fail(chunk, WorkerLost("processes died as soon as they were started"))
-        self._go_on(chunk)
+            chunk = worker.chunks.popleft()
+        # It goes on with the next, and gets one after that, while this one is unpacked.
+        self._hand_out()
+        chunk.take(answer)
 
-    def _go_on(self, finished: _QueuedTask[Input, Output]) -> None:
-        """Submit the next of the chunks that are computed one by one."""
+    def _see_to_death(self, worker: _Worker) -> None:
         with self._lock:
-            if self._one_by_one and self._one_by_one[0] is finished:
-                self._one_by_one.popleft()
-                if self._one_by_one and not self._closing:
-                    self._hand_in(self._one_by_one[0])
-
-    def _check_idle_after(self, seconds: float) -> None:
-        self._idle_check = threading.Timer(seconds, self._check_idle, (self._processes,))
-        self._idle_check.daemon = True
-        self._idle_check.start()
-
-    def _check_idle(self, processes: "_Processes[Input, Output]") -> None:
-        with self._lock:
-            if self._processes is not processes:
+            if worker not in self._workers:
                 return
-            if processes.tasks:
-                self._used_s = time.monotonic()
-            idle_s = time.monotonic() - self._used_s
-            if idle_s >= IDLE_S:
-                self._end_processes()
-                processes.executor.shutdown(wait=False)
+            self._workers.remove(worker)
+            log.warning("a process that computed chunks has died; others are started")
+            if worker.is_ready:
+                if worker.chunks:
+                    worker.chunks[0].deaths += 1
             else:
-                self._check_idle_after(IDLE_S - idle_s)
+                self._early_deaths += 1
+                self._pause()
+            self._waiting.extendleft(reversed(worker.chunks))
+            first = self._waiting[0] if worker.chunks else None
+            if first is not None and first.deaths >= MOST_DEATHS:
+                self._waiting.popleft()
+                first.fail(ChunkEndsWorkers(f"{MOST_DEATHS} processes died over it"))
+            if self._early_deaths >= MOST_STARTS and not self._workers:
+                self._early_deaths = 0
+                self._fail_waiting("processes died as soon as they were started")
+        worker.end()
+
+    def _dismiss_idle(self) -> None:
+        with self._lock:
+            if self._waiting or any(each.chunks for each in self._workers):
+                self._used_s = time.monotonic()
+            if self._workers and time.monotonic() - self._used_s >= IDLE_S:
+                self._dismiss()
+
+    def _end_dismissed(self) -> None:
+        with self._lock:
+            dismissed, self._dismissed = self._dismissed, []
+        for worker in dismissed:
+            worker.end()
 
 
-def _fail(chunk: _QueuedTask[Any, Any], error: Exception) -> None:
-    with suppress(InvalidStateError):  # Done or cancelled before.
-        chunk.done.set_exception(error)
+def _start(config: WorkerConfig, work: Callable[..., Any]) -> _Worker:
+    """Start a worker process; raises `OSError` or `EOFError` on failure."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([worker_process.__name__])
+    # Python 3.11.0 would have the server listen where every local user can connect.
+    util.abstract_sockets_supported = False  # type: ignore[misc]
+    own, other = context.Pipe()
+    process = context.Process(
+        target=serve, args=(config, work, other, logs.configured()), daemon=True
+    )
+    try:
+        with safe_path():
+            resource_tracker.ensure_running()  # it would unblock the signals
+            # The server is started too, unless it runs.  It keeps the signals blocked; each
+            # process hears none until it ignores them.
+            before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+            try:
+                forkserver.ensure_running()
+                process.start()
+            finally:
+                signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    except BaseException:
+        own.close()
+        raise
+    finally:
+        # The process alone holds this end: its death closes the connection.
+        other.close()
+    return _Worker(process, own)

@@ -8,10 +8,12 @@ import logging
 import os
 import pickle
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
-from multiprocessing.synchronize import Barrier
 from pathlib import Path
+from queue import SimpleQueue
+from threading import Thread
 from typing import Any, TypeVar
 
 from service import logs
@@ -61,46 +63,57 @@ class WorkerConfig:
         return Solver(self.missions, SkyModel(catalog, LruCache(self.cache_bytes)))
 
 
-_solver: Solver | BadConfiguration
-_all_ready: Barrier
-
-
-def begin(
+def serve(
     config: WorkerConfig,
-    stop: Connection,
-    all_ready: Barrier,
+    work: Work[Any, Any],
+    connection: Connection,
     log_settings: logs.LogSettings | None,
 ) -> None:
-    """Initialise a worker process; it exits when its parent does, or closes `stop`."""
-    global _solver, _all_ready
-    end_with_parent(stop)
-    _all_ready = all_ready
+    """Main function of a worker: compute the tasks from a connection, until it is closed.
+
+    Sends an empty message when it is ready; then for each task the packs of its results, pickled,
+    or in words why there are none.  The process exits when its parent does, too.
+    """
+    end_with_parent()
+    tasks: SimpleQueue[bytes] = SimpleQueue()
+    Thread(target=_receive, args=(connection, tasks), daemon=True).start()
     if log_settings is not None:
         logs.configure(log_settings, "worker")
     os.nice(NICENESS)
+    solver: Solver | BadConfiguration
     try:
-        _solver = config.solver()
+        solver = config.solver()
     except BadConfiguration as error:
-        # Raised here, the error would break the executor.
         log.error("a worker cannot compute: %s", error)
-        _solver = error
-        return
-    prewarm_kernels(_solver.sky, _solver.missions)
-    gc.collect()
-    gc.freeze()
+        solver = error
+    else:
+        prewarm_kernels(solver.sky, solver.missions)
+        gc.collect()
+        gc.freeze()
+    with suppress(BrokenPipeError):  # nobody waits any more
+        connection.send_bytes(b"")
+        while True:
+            connection.send_bytes(_answer(solver, work, tasks.get()))
 
 
-def ready_pid() -> int:
-    """Return the process id after all worker processes have started, so that each answers once."""
-    _all_ready.wait()
-    return os.getpid()
+def _receive(connection: Connection, tasks: "SimpleQueue[bytes]") -> None:
+    """Queue the tasks that arrive while others are computed, so that the parent can always send."""
+    try:
+        while True:
+            tasks.put(connection.recv_bytes())
+    except (EOFError, OSError):
+        os._exit(1)
 
 
-def compute(work: Work[Any, Any], task: Any) -> list[bytes]:
-    """Compute a task's results, in packs; raises `BadConfiguration` without a solver."""
-    if isinstance(_solver, BadConfiguration):
-        raise _solver
-    return packed(work(_solver, task))
+def _answer(solver: Solver | BadConfiguration, work: Work[Any, Any], task: bytes) -> bytes:
+    found: list[bytes] | str
+    try:
+        if isinstance(solver, BadConfiguration):
+            raise solver
+        found = packed(work(solver, pickle.loads(task)))
+    except Exception as error:  # the parent says so of the task, and the worker goes on
+        found = repr(error)
+    return pickle.dumps(found, pickle.HIGHEST_PROTOCOL)
 
 
 def packed(found: Sequence[object]) -> list[bytes]:

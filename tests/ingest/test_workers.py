@@ -11,6 +11,7 @@ import threading
 from collections import Counter
 from functools import partial
 from multiprocessing import forkserver
+from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 
 import httpx
@@ -250,32 +251,24 @@ def test_the_server_of_workers_is_idle_and_its_death_costs_no_chunk(local_worker
 
 @pytest.fixture
 def dies_at_start(monkeypatch):
-    """Has the first process of each of the next so many starts die before anything else happens."""
+    """Has the next so many processes die before anything else happens."""
     left = []
-    mask = signal.pthread_sigmask
+    start = ForkServerProcess.start
 
-    def after_a_start(how, signals):
-        found = mask(how, signals)
-        if how == signal.SIG_SETMASK and left:
+    def killed(process):
+        start(process)
+        if left:
             left.pop()
-            (workers,) = WATCHED
-            child, *_ = workers._processes.executor._processes.values()
-            child.kill()
-            wait_until(lambda: workers._processes.executor._broken, why="nobody has noticed")
-        return found
+            process.kill()
+            process.join()
 
-    monkeypatch.setattr(signal, "pthread_sigmask", after_a_start)
-    yield lambda starts: left.extend(range(starts))
-    WATCHED.clear()
-
-
-WATCHED = []
+    monkeypatch.setattr(ForkServerProcess, "start", killed)
+    return lambda starts: left.extend(range(starts))
 
 
 @pytest.mark.parametrize("starts", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_process_that_dies_at_its_start_costs_no_chunk(local_workers, dies_at_start, starts):
     workers = local_workers(double, 2)
-    WATCHED.append(workers)
     assert workers.submit(1).result(GIVE_UP_S) == [2]
     # Those that take the place of the one that dies over 13 die at their start.
     dies_at_start(starts)
@@ -285,7 +278,6 @@ def test_a_process_that_dies_at_its_start_costs_no_chunk(local_workers, dies_at_
 def test_a_process_that_dies_while_others_are_started_is_replaced(local_workers, dies_at_start):
     """Though no chunk is handed in: a replay hands none in before processes are ready."""
     workers = local_workers(double, 2)
-    WATCHED.append(workers)
     dies_at_start(1)
     workers.start()
 

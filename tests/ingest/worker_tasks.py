@@ -32,7 +32,10 @@ def half_sent(solver, number):
     if number == 13:
 
         def send_half(connection, content):
-            os.write(connection.fileno(), bytes(content[: len(content) // 2]))
+            half = len(content) // 2 if len(content) > 1_000 else len(content)
+            os.write(connection.fileno(), bytes(content[:half]))
+            if half == len(content):
+                return
             os.kill(os.getpid(), signal.SIGKILL)
 
         multiprocessing.connection.Connection._send = send_half
