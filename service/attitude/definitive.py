@@ -3,7 +3,7 @@
 An innovation is the rotation from the filter's prediction to a measured attitude.  A difference
 is that from the smoothed attitude to the measurement: the smoother has used it, so their errors
 are correlated, and the covariance of the difference is R - P; of a measurement that was not used
-it is R + P.  Both are what a page of grades shows and what noise is estimated from.
+it is R + P.  The page of the definitive attitude shows both, and noise is estimated from them.
 """
 
 import zlib
@@ -110,7 +110,7 @@ def was_used(outcome: Integers) -> npt.NDArray[np.bool_]:
 
 
 @dataclass(frozen=True, eq=False)
-class GradedSamples(TimedColumns):
+class DefinitiveSamples(TimedColumns):
     """Attitudes of a stretch of one grade.
 
     `tai_ns` (n,), `quaternion` (n, 4) inertial to body, `covariance_arcsec2` (n, 6) of the small
@@ -138,7 +138,7 @@ def day_bounds(day: int) -> tuple[Utc, Utc]:
 # Times and quaternions keep every bit, all else has the seven digits of a float32.  The bytes of
 # equal weight stand together, so that signs and exponents, which hardly change, take no room.
 
-Packable = TypeVar("Packable", GradedSamples, MeasuredInnovations)
+Packable = TypeVar("Packable", DefinitiveSamples, MeasuredInnovations)
 Fields = tuple[tuple[str, str, int], ...]
 
 LEVEL = 1
@@ -146,7 +146,7 @@ LEVEL = 1
 MOST_PACKED = 3_600
 """The most samples of a block: an hour."""
 _FIELDS: dict[type, Fields] = {
-    GradedSamples: (
+    DefinitiveSamples: (
         ("tai_ns", "<i8", 1),
         ("quaternion", "<f8", 4),
         ("covariance_arcsec2", "<f4", 6),
@@ -170,7 +170,7 @@ _FIELDS: dict[type, Fields] = {
 _NUMBERS = {"i": np.int64, "u": np.int64, "f": np.float64}
 
 
-def packed(samples: GradedSamples | MeasuredInnovations) -> bytes:
+def packed(samples: DefinitiveSamples | MeasuredInnovations) -> bytes:
     """The compressed bytes of samples."""
     parts = []
     for name, kind, _ in _FIELDS[type(samples)]:
@@ -183,12 +183,12 @@ def packed(samples: GradedSamples | MeasuredInnovations) -> bytes:
     return zlib.compress(b"".join(parts), LEVEL)
 
 
-def unpacked(data: bytes, samples: int) -> GradedSamples:
+def unpacked(data: bytes, samples: int) -> DefinitiveSamples:
     """Unpack `samples` samples, the reverse of `packed`.
 
     Raises `ValueError` for bytes that are damaged or hold another number of samples.
     """
-    return _unpacked(GradedSamples, data, samples)
+    return _unpacked(DefinitiveSamples, data, samples)
 
 
 def unpacked_innovations(data: bytes, measurements: int) -> MeasuredInnovations:

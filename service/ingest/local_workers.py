@@ -73,7 +73,7 @@ class _Chunk:
             self.done.set_exception(error)
 
     def take(self, answer: bytes) -> None:
-        """Set the future from a worker's answer: packs of results, or in words why there are none."""
+        """Set the future from a worker's answer: packs of results, or a reason in words."""
         try:
             packs = pickle.loads(answer)
             if isinstance(packs, str):
@@ -122,7 +122,7 @@ class LocalWorkers(Generic[Input, Output]):
         self._are_wanted = False
         self._closing = False
         self._early_deaths = 0
-        """Number of processes that died before they were ready, since the last that became ready."""
+        """Number of processes that died early since one last became ready."""
         self._pause_s = PAUSE_S
         self._not_before_s = 0.0
         self._used_s = 0.0

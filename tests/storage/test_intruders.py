@@ -105,7 +105,7 @@ CHANGES = {
     "an adoption": "UPDATE calibration_adoptions SET who = 'B'",
     "what was adopted": "UPDATE calibration_adoptions SET trackers = '[]'",
     "an adoption that is removed": "DELETE FROM calibration_adoptions",
-    # ---- gyro blocks and graded days
+    # ---- gyro blocks and definitive days
     "the rates of a gyro block": "UPDATE gyro_blocks SET rates_rad_per_s = :bytes",
     "the receipt of a gyro block": "UPDATE gyro_blocks SET received = '1990-01-01'",
     "a gyro block that is removed": "DELETE FROM gyro_blocks",

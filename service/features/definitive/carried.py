@@ -1,9 +1,9 @@
 """Attitude filter for live data, continued from stored states as more data are recorded.
 
 The input is always the whole record of the window, and the result depends on it alone: it equals
-the result of `day.grade_day` at the last epoch of the same record.  Filter states at regular marks
-are kept, so that only new data are filtered; a late measurement, or other settings, drop the later
-marks.
+the result of `day.definitive_day` at the last epoch of the same record.  Filter states at regular
+marks are kept, so that only new data are filtered; a late measurement, or other settings, drop the
+later marks.
 
 The window does not grow with the day, unlike that of `day.window_of`: at most seven hours of
 attitudes and gyro samples are read, or 13 hours of gyro samples if batches have stopped.
@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from service.attitude.definitive import GradedSamples, Model
+from service.attitude.definitive import DefinitiveSamples, Model
 from service.features.definitive.day import WARM_UP_S, samples_of
 from service.features.definitive.kernels.filter import filter_attitude
 from service.features.definitive.kernels.inputs import ConstantRateModel
@@ -63,7 +63,7 @@ class Carried:
     """Filtered attitude at the last epoch: one sample, and the motion model used."""
 
     model: Model
-    sample: GradedSamples
+    sample: DefinitiveSamples
 
 
 class CarriedFilter:

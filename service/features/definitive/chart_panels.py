@@ -6,13 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from service.attitude.definitive import Integers, Status
-from service.features.definitive.period import GradesOfPeriod
+from service.features.definitive.period import DefinitivePeriod
 from service.vectors import Vector
 from service.web.console.charts.panels import HEIGHT, WIDTH, Mask, Scale, TimeAxis, Trace
 
 
 @dataclass(frozen=True)
-class GradePanel:
+class ChartPanel:
     """Chart of one axis; `marks` show rejected values, clipped to the edge."""
 
     axis: str
@@ -36,12 +36,12 @@ class GradePanel:
 
 
 @dataclass(frozen=True)
-class GradeChart:
+class Chart:
     """Chart with a panel per axis in one unit; `rows` hold the same data as a table."""
 
     id: str
     title: str
-    panels: tuple[GradePanel, ...]
+    panels: tuple[ChartPanel, ...]
     columns: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
     width: int = WIDTH
@@ -102,7 +102,7 @@ class Strip:
     height: int = STRIP_HEIGHT
 
 
-def strips(found: GradesOfPeriod, axis: TimeAxis) -> list[Strip]:
+def strips(found: DefinitivePeriod, axis: TimeAxis) -> list[Strip]:
     """Status strips: motion model of the filter, and status of filtered and smoothed attitudes."""
     drawn = [
         Strip(

@@ -10,14 +10,14 @@ import numpy as np
 
 from service.attitude.definitive import Integers, MeasuredInnovations, Status
 from service.features.definitive.chart_panels import (
-    GradeChart,
-    GradePanel,
+    Chart,
+    ChartPanel,
     joined_moments,
     marks_of,
     scale_of,
 )
 from service.features.definitive.kernels.inputs import FilterSettings
-from service.features.definitive.period import PARTS, GradesOfPeriod
+from service.features.definitive.period import PARTS, DefinitivePeriod
 from service.missions.mission import Tracker
 from service.vectors import (
     Vector,
@@ -39,9 +39,9 @@ WIDEST = 2.0
 """Half height of a chart, in multiples of the usual error band."""
 
 
-def grade_charts(
-    found: GradesOfPeriod, axis: TimeAxis, tracker: Tracker | None = None
-) -> list[GradeChart]:
+def definitive_charts(
+    found: DefinitivePeriod, axis: TimeAxis, tracker: Tracker | None = None
+) -> list[Chart]:
     """Charts of filtered and smoothed attitudes in a period, in page order; empty ones are left
     out.
 
@@ -54,7 +54,7 @@ def grade_charts(
     return [*(each for each in drawn if each), *_bias(found, axis)]
 
 
-def _joins(found: GradesOfPeriod, axis: TimeAxis) -> Mask:
+def _joins(found: DefinitivePeriod, axis: TimeAxis) -> Mask:
     is_gyro = found.is_gyro
     same = np.append(False, is_gyro[1:] == is_gyro[:-1])[: len(is_gyro)]
     return joined_moments(found.samples["smoothed"].tai_ns, axis, PARTS, same)
@@ -64,7 +64,7 @@ def _known(status: Integers) -> Mask:
     return np.asarray(~np.isin(status, (Status.NONE, Status.LOST)))
 
 
-def _by_grade(found: GradesOfPeriod, name: str) -> dict[str, Vector]:
+def _by_grade(found: DefinitivePeriod, name: str) -> dict[str, Vector]:
     """Values (n, ...) of filtered and smoothed attitudes by grade, NaN without an attitude."""
     return {
         grade: np.where(_known(each.status)[:, None], getattr(each, name), np.nan)
@@ -72,7 +72,7 @@ def _by_grade(found: GradesOfPeriod, name: str) -> dict[str, Vector]:
     }
 
 
-def direction_chart(found: GradesOfPeriod, axis: TimeAxis, tracker: Tracker) -> GradeChart | None:
+def direction_chart(found: DefinitivePeriod, axis: TimeAxis, tracker: Tracker) -> Chart | None:
     """Chart of a boresight's right ascension, declination and roll; lines break at 360 degrees."""
     samples = found.samples["smoothed"]
     known = _known(samples.status)
@@ -95,8 +95,8 @@ def direction_chart(found: GradesOfPeriod, axis: TimeAxis, tracker: Tracker) -> 
         trace = Values(samples.tai_ns, shown, joins & ~wrapped).trace("smoothed", axis, scale)
         low, high = f"{level(scale.low)}°", f"{level(scale.high)}°"
         rows.append((name, low, high))
-        panels.append(GradePanel(name, (trace,), "", "", (), f"{low} to {high}", scale, "°"))
-    return GradeChart(
+        panels.append(ChartPanel(name, (trace,), "", "", (), f"{low} to {high}", scale, "°"))
+    return Chart(
         "direction",
         f"Boresight of {tracker.name}; roll: position angle of its +Y, from north through east",
         tuple(panels),
@@ -106,7 +106,7 @@ def direction_chart(found: GradesOfPeriod, axis: TimeAxis, tracker: Tracker) -> 
     )
 
 
-def _attitude(found: GradesOfPeriod, axis: TimeAxis) -> GradeChart | None:
+def _attitude(found: DefinitivePeriod, axis: TimeAxis) -> Chart | None:
     """Chart of the rotation from the first good smoothed attitude."""
     samples = found.samples["smoothed"]
     known = _known(samples.status)
@@ -132,7 +132,7 @@ def _attitude(found: GradesOfPeriod, axis: TimeAxis) -> GradeChart | None:
     )
 
 
-def _rate(found: GradesOfPeriod, axis: TimeAxis) -> GradeChart | None:
+def _rate(found: DefinitivePeriod, axis: TimeAxis) -> Chart | None:
     # Without a gyro the rate is not measured: until it is confirmed it is only the first guess.
     rates: dict[str, Vector] = {
         grade: np.where((found.is_gyro | (each.status == Status.GOOD))[:, None], rate, np.nan)
@@ -148,7 +148,7 @@ def _rate(found: GradesOfPeriod, axis: TimeAxis) -> GradeChart | None:
     return _lines("rate", "Rate", unit, rates, found, axis, _joins(found, axis))
 
 
-def _sigma(found: GradesOfPeriod, axis: TimeAxis) -> GradeChart | None:
+def _sigma(found: DefinitivePeriod, axis: TimeAxis) -> Chart | None:
     """Chart of the attitude's standard deviation by grade, on a logarithmic scale.
 
     The scale fits good attitudes; other values, as after a start, may lie far outside and are drawn
@@ -184,14 +184,12 @@ def _sigma(found: GradesOfPeriod, axis: TimeAxis) -> GradeChart | None:
         cells = tuple(medians.get(grade, "–") for grade in ("raw", *found.samples))
         rows.append((name, *cells))
         note = f"{level(scale.low)} to {level(scale.high)}″, logarithmic"
-        panels.append(GradePanel(name, tuple(traces), "", "", (), note, scale, "″"))
+        panels.append(ChartPanel(name, tuple(traces), "", "", (), note, scale, "″"))
     columns = ("axis", *(f"median of {grade}" for grade in ("raw", *found.samples)))
-    return GradeChart(
-        "sigma", "One σ of the attitude, by grade", tuple(panels), columns, tuple(rows)
-    )
+    return Chart("sigma", "One σ of the attitude, by grade", tuple(panels), columns, tuple(rows))
 
 
-def _differences(met: MeasuredInnovations, axis: TimeAxis) -> GradeChart:
+def _differences(met: MeasuredInnovations, axis: TimeAxis) -> Chart:
     """Chart of measured minus smoothed attitudes with bounds; unused measurements are marked."""
     return bounded_chart(
         "difference",
@@ -210,7 +208,7 @@ def bounded_chart(
     value_arcsec: Vector,
     sigma_arcsec: Vector,
     axis: TimeAxis,
-) -> GradeChart:
+) -> Chart:
     """Chart of values (m, 3) as dots within a band of three sigmas.
 
     The scale fits the usual band and the used values: other values are marked at the edge, and
@@ -241,7 +239,7 @@ def bounded_chart(
             )
         )
         panels.append(
-            GradePanel(
+            ChartPanel(
                 name,
                 (dots,),
                 band_of(met.tai_ns, -bound, bound, joins, axis, scale),
@@ -253,10 +251,10 @@ def bounded_chart(
             )
         )
     columns = ("axis", "mean", "median σ", "rms over σ", "beyond 3σ", "not used")
-    return GradeChart(id, title, tuple(panels), columns, tuple(rows))
+    return Chart(id, title, tuple(panels), columns, tuple(rows))
 
 
-def _bias(found: GradesOfPeriod, axis: TimeAxis) -> list[GradeChart]:
+def _bias(found: DefinitivePeriod, axis: TimeAxis) -> list[Chart]:
     """Charts of the gyro bias with its standard deviation; none at a constant rate."""
     bias = _by_grade(found, "bias_deg_per_h")
     sigma = _by_grade(found, "bias_sigma_deg_per_h")
@@ -275,12 +273,12 @@ def _bias(found: GradesOfPeriod, axis: TimeAxis) -> list[GradeChart]:
         area = band_of(times, best - width, best + width, joins, axis, inner)
         note = f"{level(float(np.nanmin(best)))} to {level(float(np.nanmax(best)))}°/h"
         note += f", σ {level(usual)}°/h"
-        panels.append(GradePanel(name, tuple(traces), area, "", (), note, inner, "°/h"))
+        panels.append(ChartPanel(name, tuple(traces), area, "", (), note, inner, "°/h"))
         of_filter = _median(sigma["filtered"][:, k])
         cells = f"{level(_median(best))}°/h", f"{level(usual)}°/h", f"{level(of_filter)}°/h"
         rows.append((name, *cells))
     columns = ("axis", "median", "median σ, smoothed", "median σ, filtered")
-    return [GradeChart("bias", "Bias of the gyro", tuple(panels), columns, tuple(rows))]
+    return [Chart("bias", "Bias of the gyro", tuple(panels), columns, tuple(rows))]
 
 
 def _lines(
@@ -288,10 +286,10 @@ def _lines(
     title: str,
     unit: str,
     values: dict[str, Vector],
-    found: GradesOfPeriod,
+    found: DefinitivePeriod,
     axis: TimeAxis,
     joins: Mask,
-) -> GradeChart:
+) -> Chart:
     times = found.samples["smoothed"].tai_ns
     panels, rows = [], []
     for k, name in enumerate(AXES):
@@ -302,8 +300,8 @@ def _lines(
         ]
         low, high = f"{level(scale.low)}{unit}", f"{level(scale.high)}{unit}"
         rows.append((name, low, high))
-        panels.append(GradePanel(name, tuple(traces), "", "", (), f"{low} to {high}", scale, unit))
-    return GradeChart(id, title, tuple(panels), ("axis", "least", "greatest"), tuple(rows))
+        panels.append(ChartPanel(name, tuple(traces), "", "", (), f"{low} to {high}", scale, unit))
+    return Chart(id, title, tuple(panels), ("axis", "least", "greatest"), tuple(rows))
 
 
 def _largest(values: Vector) -> float:
@@ -332,7 +330,7 @@ def chi_square_bounds() -> tuple[float, float, float]:
     return low, high, most
 
 
-def innovation_charts(met: MeasuredInnovations, axis: TimeAxis) -> list[GradeChart]:
+def innovation_charts(met: MeasuredInnovations, axis: TimeAxis) -> list[Chart]:
     """Charts of innovations about the body axes, and of their chi-square."""
     known = met.taken(np.isfinite(met.nis))
     if not len(known):
@@ -351,14 +349,14 @@ def innovation_charts(met: MeasuredInnovations, axis: TimeAxis) -> list[GradeCha
     ]
 
 
-def _chi_square(met: MeasuredInnovations, axis: TimeAxis) -> GradeChart:
+def _chi_square(met: MeasuredInnovations, axis: TimeAxis) -> Chart:
     low, high, gate = chi_square_bounds()
     used = met.is_used
     scale = Scale(low / 4.0, gate * 2.0, is_log=True)
     inside = int(np.count_nonzero((met.nis[used] >= low) & (met.nis[used] <= high)))
     count = int(np.count_nonzero(used))
     mean = float(met.nis[used].mean()) / DEGREES if count else 0.0
-    panel = GradePanel(
+    panel = ChartPanel(
         "χ²",
         (Values(met.tai_ns[used], met.nis[used]).trace("raw", axis, scale),),
         "",
@@ -371,4 +369,4 @@ def _chi_square(met: MeasuredInnovations, axis: TimeAxis) -> GradeChart:
     share = f"{100.0 * inside / count:.1f} %" if count else "–"
     row = ("χ²", level(mean), share, str(int(np.count_nonzero(~used))))
     columns = ("", "mean by degree, about 1", "inside 95 %", "not used")
-    return GradeChart("chi-square", "Chi-square of each measurement", (panel,), columns, (row,))
+    return Chart("chi-square", "Chi-square of each measurement", (panel,), columns, (row,))

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from service.attitude.definitive import (
+    DefinitiveSamples,
     Grade,
-    GradedSamples,
     MeasuredInnovations,
     Model,
     Outcome,
@@ -86,29 +86,29 @@ STEP_NS = 10**9
 MOST_SAMPLES = 4_000_000
 """Greatest number of gyro samples of a day and its margins: 30 Hz, 1 kB of memory each."""
 OUTCOMES = {each.name.lower(): int(each) for each in Outcome}
-"""Outcomes of a measurement in the filter, by name; see `filtering.result.Outcome`."""
+"""Outcomes of a measurement in the filter, by name; see `kernels.result.Outcome`."""
 
 
 @dataclass(frozen=True, eq=False)
-class GradedStretch:
+class DefinitiveStretch:
     """Unbroken interval of a day with filtered and smoothed samples, and innovations."""
 
     model: Model
-    samples: dict[Grade, GradedSamples]
+    samples: dict[Grade, DefinitiveSamples]
     innovations: MeasuredInnovations
 
 
 @dataclass(frozen=True, eq=False)
-class GradedDay:
+class DefinitiveDay:
     """Filtered and smoothed attitudes of a day, with counts of the measurements and gyro samples.
 
-    `measurements` counts by the names of `filtering.result.Outcome`, and `unusable` and `alone`
+    `measurements` counts by the names of `kernels.result.Outcome`, and `unusable` and `alone`
     ones; `gyro` counts samples, gaps, samples beyond the largest rate, and zeros while the body
     turned.  `nis_per_degree` is the mean of z^T S^-1 z of the accepted measurements per degree of
     freedom: about 1.
     """
 
-    stretches: list[GradedStretch]
+    stretches: list[DefinitiveStretch]
     measurements: dict[str, int]
     gyro: dict[str, int]
     nis_per_degree: float | None
@@ -125,7 +125,7 @@ def window_of(day: int) -> tuple[Utc, Utc]:
     return shifted(start, -WARM_UP_S), shifted(end, LOOK_AHEAD_S)
 
 
-def grade_day(recorded: Recorded, mission: Mission, day: int) -> GradedDay:
+def definitive_day(recorded: Recorded, mission: Mission, day: int) -> DefinitiveDay:
     """Filter and smooth the record of a day's window; see `window_of`.
 
     Raises `BadInput` for more gyro samples than fit into memory.
@@ -142,9 +142,9 @@ def grade_day(recorded: Recorded, mission: Mission, day: int) -> GradedDay:
     for each in found.stretches:
         result = filter_attitude(each.model, each.gyro, each.attitudes, each.directions)
         smoothed = smooth(result, each.model)
-        graded = _graded(each, result, smoothed, start, end)
-        if graded is not None:
-            stretches.append(graded)
+        computed = _stretch_of_day(each, result, smoothed, start, end)
+        if computed is not None:
+            stretches.append(computed)
         met = result.innovations
         inside = (met.tai_ns >= start) & (met.tai_ns < end)
         for name, code in OUTCOMES.items():
@@ -157,7 +157,7 @@ def grade_day(recorded: Recorded, mission: Mission, day: int) -> GradedDay:
         # The first step of a gap begins with it.
         gaps += int(np.count_nonzero(result.steps.gap_s[of_day] == 0.0))
     of_gyro = (recorded.gyro_ns >= start) & (recorded.gyro_ns < end)
-    return GradedDay(
+    return DefinitiveDay(
         stretches,
         {**outcomes, "unusable": recorded.unusable, "alone": found.alone},
         {
@@ -170,15 +170,15 @@ def grade_day(recorded: Recorded, mission: Mission, day: int) -> GradedDay:
     )
 
 
-def _graded(
+def _stretch_of_day(
     stretch: Stretch, result: FilterResult, smoothed: AttitudeHistory, start: int, end: int
-) -> GradedStretch | None:
+) -> DefinitiveStretch | None:
     """Part of a filtered and smoothed interval within the day; None if there is none."""
     kept = _kept(result.history, start, end)
     if not kept.any():
         return None
     is_constant = isinstance(stretch.model, ConstantRateModel)
-    return GradedStretch(
+    return DefinitiveStretch(
         "constant_rate" if is_constant else "gyro",
         {
             "filtered": samples_of(result.history, kept, is_constant),
@@ -197,7 +197,7 @@ def _kept(history: AttitudeHistory, start: int, end: int) -> Mask:
     return np.asarray(inside & is_first)
 
 
-def samples_of(history: AttitudeHistory, kept: Mask, is_constant: bool) -> GradedSamples:
+def samples_of(history: AttitudeHistory, kept: Mask, is_constant: bool) -> DefinitiveSamples:
     """Convert the selected epochs (mask (n,)) of an attitude history to stored samples."""
     quaternion = history.quaternion[kept]
     quaternion = np.where(quaternion[:, 3:] < 0.0, -quaternion, quaternion)
@@ -209,7 +209,7 @@ def samples_of(history: AttitudeHistory, kept: Mask, is_constant: bool) -> Grade
     upper = attitude[:, *UPPER] * ARCSEC_PER_RADIAN**2
     bias = np.degrees(history.bias_rad_s[kept]) * 3600.0
     sigma = np.sqrt(covariance[:, axes + 3, axes + 3])
-    return GradedSamples(
+    return DefinitiveSamples(
         history.tai_ns[kept],
         quaternion,
         upper,

@@ -10,7 +10,7 @@ from service.app.context import Context, PageOfPeriod, checked_run_name
 from service.contract.base import Page
 from service.errors import NotFound
 from service.features.definitive import period, records
-from service.features.definitive.day import grade_day, window_of
+from service.features.definitive.day import definitive_day, window_of
 from service.features.definitive.inputs import days_with_batches, inputs_digest, recorded_in
 from service.missions.mission import Mission, mission_named
 from service.storage.archive.reading import holds_any
@@ -30,7 +30,7 @@ class SmoothProgress:
     """
 
     total: int
-    days: list[records.GradedDayRow] = field(default_factory=list)
+    days: list[records.DefinitiveDayRow] = field(default_factory=list)
     new: set[str] = field(default_factory=set)
     empty: int = 0
     archived: int = 0
@@ -82,11 +82,13 @@ class DefinitiveDays:
         """Page of innovations (measured minus predicted attitudes), earliest first."""
         return self._context.page(period.list_innovations, ResultFilter, name, asked)
 
-    def of_period(self, name: str, run: str, start: Utc, end: Utc) -> period.GradesOfPeriod | None:
+    def of_period(
+        self, name: str, run: str, start: Utc, end: Utc
+    ) -> period.DefinitivePeriod | None:
         """Thinned samples and innovations of a period; None if none are recorded."""
         self._context.mission(name)
         with self._context.reading() as connection:
-            return period.grades_of_period(connection, name, run, start, end)
+            return period.definitive_period(connection, name, run, start, end)
 
     def _smooth_day(self, mission: Mission, key: records.DayKey, progress: SmoothProgress) -> None:
         window = window_of(key.day)
@@ -100,13 +102,13 @@ class DefinitiveDays:
         if before is not None and before.inputs == inputs:
             progress.days.append(before)
             return
-        graded = grade_day(recorded, mission, key.day)
-        if before is None and not graded.samples:
+        computed = definitive_day(recorded, mission, key.day)
+        if before is None and not computed.samples:
             progress.empty += 1
             return
-        rows = records.rows_of(key, graded, inputs, self._ids.new(), utc_now())
+        rows = records.rows_of(key, computed, inputs, self._ids.new(), utc_now())
 
-        def change(connection: Connection) -> records.GradedDayRow:
+        def change(connection: Connection) -> records.DefinitiveDayRow:
             recorded_day = records.record_day(connection, key, rows)
             # Another process may have recorded the same meanwhile.
             if recorded_day.id == rows[0]["id"]:

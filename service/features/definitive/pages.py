@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 from starlette.responses import Response
 
-from service.features.definitive.chart_panels import GradeChart, Strip, strips
-from service.features.definitive.charts import grade_charts, innovation_charts
+from service.features.definitive.chart_panels import Chart, Strip, strips
+from service.features.definitive.charts import definitive_charts, innovation_charts
 from service.features.definitive.part import Definitive
-from service.features.definitive.period import GradesOfPeriod
+from service.features.definitive.period import DefinitivePeriod
 from service.storage.queries.definitive import MOST_BLOCKS
 from service.web.console.charts.panels import TimeAxis
 from service.web.console.page import ContextDep, FromQuery, console_page
@@ -23,9 +23,9 @@ JOBS = 8
 class Drawn:
     """Charts and strips of a period, ready to be drawn."""
 
-    found: GradesOfPeriod
-    charts: list[GradeChart]
-    innovations: list[GradeChart]
+    found: DefinitivePeriod
+    charts: list[Chart]
+    innovations: list[Chart]
     strips: list[Strip]
     ticks: list[tuple[float, str]]
     """Tick marks of the time axis: percent from the left, and text."""
@@ -34,7 +34,7 @@ class Drawn:
 @console_page(
     "/spacecraft/{name}/grades", "Definitive attitude", Policy("read", "path"), section="/"
 )
-def grades_page(name: str, query: FromQuery[SpacecraftQuery], context: ContextDep) -> Response:
+def definitive_page(name: str, query: FromQuery[SpacecraftQuery], context: ContextDep) -> Response:
     """Console page with filtered and smoothed attitudes of a spacecraft, and their measurements."""
     definitive, mission = context.app.part(Definitive), context.app.context.mission(name)
     shown = shown_period(context, name, query)
@@ -46,13 +46,13 @@ def grades_page(name: str, query: FromQuery[SpacecraftQuery], context: ContextDe
             met = found.innovations
             drawn = Drawn(
                 found,
-                grade_charts(found, axis, mission.trackers[0]),
+                definitive_charts(found, axis, mission.trackers[0]),
                 [] if met is None else innovation_charts(met, axis),
                 strips(found, axis),
                 axis.ticks(),
             )
     return context.rendered(
-        "grades.html.jinja",
+        "definitive.html.jinja",
         query.run,
         name=name,
         missing=without_gyro(context, name, query.run, shown) if shown else "",

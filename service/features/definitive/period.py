@@ -11,8 +11,8 @@ from sqlalchemy import Connection, select, tuple_
 
 from service.attitude.definitive import (
     GRADES,
+    DefinitiveSamples,
     Grade,
-    GradedSamples,
     Integers,
     MeasuredInnovations,
     Outcome,
@@ -24,7 +24,7 @@ from service.attitude.definitive import (
 from service.contract.base import Page
 from service.errors import BadBatch, Fault, shown_value
 from service.feature import feature_modules
-from service.features.definitive.records import DayKey, GradedDayRow, Innovation, shown
+from service.features.definitive.records import DayKey, DefinitiveDayRow, Innovation, shown
 from service.gyro.blocks import texts_of
 from service.missions.mission import Mission
 from service.storage.gyro import inside
@@ -53,7 +53,7 @@ _SEVERITY = {Status.NONE: 3, Status.LOST: 3, Status.DOUBTFUL: 2, Status.STARTING
 
 
 @dataclass(frozen=True, eq=False)
-class GradesOfPeriod:
+class DefinitivePeriod:
     """Filtered and smoothed attitudes of a period, thinned to the resolution of a chart.
 
     `samples` have one sample in each of `PARTS` equal parts of the period, the one with the worst
@@ -64,18 +64,18 @@ class GradesOfPeriod:
     `total_days`.
     """
 
-    samples: dict[Grade, GradedSamples]
+    samples: dict[Grade, DefinitiveSamples]
     is_gyro: npt.NDArray[np.bool_]
     innovations: MeasuredInnovations | None
     is_whole: bool
     stretches: list[tuple[str, int, int]]
-    days: list[GradedDayRow]
+    days: list[DefinitiveDayRow]
     total_days: int
 
 
-def grades_of_period(
+def definitive_period(
     connection: Connection, spacecraft: str, run: str, start: Utc, end: Utc
-) -> GradesOfPeriod | None:
+) -> DefinitivePeriod | None:
     """Read the filtered and smoothed attitudes of a period; None if none are recorded."""
     selected = ResultFilter(run, spacecraft, start, end)
     blocks = blocks_of(connection, selected, "smoothed")
@@ -96,7 +96,7 @@ def grades_of_period(
         end,
     )
     is_gyro = _repeated_models(read, whole["smoothed"].tai_ns)
-    return GradesOfPeriod(
+    return DefinitivePeriod(
         samples={grade: each.taken(places) for grade, each in whole.items()},
         is_gyro=is_gyro[places],
         innovations=_innovations(connection, _spread(measured), selected, start, end),
@@ -114,9 +114,9 @@ def _spread(blocks: Sequence[Block]) -> list[Block]:
     return [blocks[place] for place in chosen.tolist()]
 
 
-def _samples(connection: Connection, grade: Grade, read: Sequence[Block]) -> GradedSamples:
+def _samples(connection: Connection, grade: Grade, read: Sequence[Block]) -> DefinitiveSamples:
     found = [unpacked(row.packed, row.samples) for row in packed_samples(connection, grade, read)]
-    return GradedSamples.joined(found)
+    return DefinitiveSamples.joined(found)
 
 
 def _severity(status: Integers) -> Integers:
@@ -214,7 +214,7 @@ def _read_cursor(cursor: str) -> tuple[int, int, int]:
 
 
 def evaluate_day(
-    connection: Connection, mission: Mission, key: DayKey, row: GradedDayRow, features_off: str
+    connection: Connection, mission: Mission, key: DayKey, row: DefinitiveDayRow, features_off: str
 ) -> None:
     """Evaluate limits on the share of rejected measurements for a newly recorded day.
 

@@ -25,7 +25,7 @@ from sqlalchemy import (
 from service.attitude.definitive import (
     GRADES,
     MOST_PACKED,
-    GradedSamples,
+    DefinitiveSamples,
     MeasuredInnovations,
     Status,
     day_bounds,
@@ -48,9 +48,9 @@ from service.contract.base import (
 )
 from service.contract.base import Status as StatusName
 from service.features.definitive.carried import Carried
-from service.features.definitive.day import GradedDay, GradedStretch
+from service.features.definitive.day import DefinitiveDay, DefinitiveStretch
 from service.gyro.blocks import texts_of
-from service.storage.queries.definitive import STATUS, DaySummary, GradedStretchInfo
+from service.storage.queries.definitive import STATUS, DaySummary, DefinitiveStretchInfo
 from service.storage.queries.pages import covariance_of
 from service.storage.sql.columns import Row
 from service.storage.sql.definitive_tables import INNOVATIONS, graded_blocks, graded_days
@@ -144,7 +144,7 @@ class DayKey:
         return [c.spacecraft == self.spacecraft, c.run == self.run, c.day == self.day]
 
 
-class GradedDayRow(Struct, frozen=True, kw_only=True):
+class DefinitiveDayRow(Struct, frozen=True, kw_only=True):
     """Database record of a day of filtered and smoothed attitudes."""
 
     id: Id
@@ -159,25 +159,25 @@ class GradedDayRow(Struct, frozen=True, kw_only=True):
     summary: DaySummary
 
 
-def current_day(connection: Connection, key: DayKey) -> GradedDayRow | None:
+def current_day(connection: Connection, key: DayKey) -> DefinitiveDayRow | None:
     """Current revision of a filtered day; None without any."""
     query = select(graded_days).where(*key.conditions(), graded_days.c.current)
     row = connection.execute(query).mappings().first()
     return None if row is None else shown(row)
 
 
-def rows_of(key: DayKey, graded: GradedDay, inputs: str, id: str, created: Utc) -> list[Row]:
+def rows_of(key: DayKey, computed: DefinitiveDay, inputs: str, id: str, created: Utc) -> list[Row]:
     """Database rows of a filtered day: the day without revision, followed by its blocks."""
-    blocks = list(_blocks(id, graded))
+    blocks = list(_blocks(id, computed))
     digest = hashlib.sha256()
     for block in blocks:
         digest.update(block["packed"])
     start, end = day_bounds(key.day)
     summary = DaySummary(
-        stretches=[_stretch(start, each) for each in graded.stretches],
-        measurements=graded.measurements,
-        gyro=graded.gyro,
-        nis_per_degree=graded.nis_per_degree,
+        stretches=[_stretch(start, each) for each in computed.stretches],
+        measurements=computed.measurements,
+        gyro=computed.gyro,
+        nis_per_degree=computed.nis_per_degree,
     )
     day = {
         "id": id,
@@ -190,13 +190,13 @@ def rows_of(key: DayKey, graded: GradedDay, inputs: str, id: str, created: Utc) 
         "created": created.text,
         "inputs": inputs,
         "digest": f"sha256:{digest.hexdigest()}",
-        "samples": graded.samples,
+        "samples": computed.samples,
         "summary": msgspec.json.encode(summary).decode(),
     }
     return [day, *blocks]
 
 
-def record_day(connection: Connection, key: DayKey, rows: list[Row]) -> GradedDayRow:
+def record_day(connection: Connection, key: DayKey, rows: list[Row]) -> DefinitiveDayRow:
     """Record a new revision of a filtered day in place of the current one.
 
     A day that another process recorded from the same input stays unchanged.
@@ -220,24 +220,24 @@ def record_day(connection: Connection, key: DayKey, rows: list[Row]) -> GradedDa
     return shown(new)
 
 
-def shown(row: Any) -> GradedDayRow:
+def shown(row: Any) -> DefinitiveDayRow:
     """Convert a database row of a filtered day to an API record."""
     start, _ = day_bounds(row["day"])
-    return GradedDayRow(
+    return DefinitiveDayRow(
         **{name: row[name] for name in SHOWN},
         day=start.text[:10],
         summary=msgspec.json.decode(row["summary"], type=DaySummary),
     )
 
 
-def _blocks(day_id: str, graded: GradedDay) -> Iterator[Row]:
-    by_kind: dict[str, list[GradedSamples | MeasuredInnovations]] = {
-        **{grade: [each.samples[grade] for each in graded.stretches] for grade in GRADES},
-        INNOVATIONS: [each.innovations for each in graded.stretches],
+def _blocks(day_id: str, computed: DefinitiveDay) -> Iterator[Row]:
+    by_kind: dict[str, list[DefinitiveSamples | MeasuredInnovations]] = {
+        **{grade: [each.samples[grade] for each in computed.stretches] for grade in GRADES},
+        INNOVATIONS: [each.innovations for each in computed.stretches],
     }
     for kind, wholes in by_kind.items():
         position = 0
-        for stretch, whole in zip(graded.stretches, wholes, strict=True):
+        for stretch, whole in zip(computed.stretches, wholes, strict=True):
             for part in _parts(whole):
                 yield {
                     "day_id": day_id,
@@ -253,21 +253,21 @@ def _blocks(day_id: str, graded: GradedDay) -> Iterator[Row]:
 
 
 def _parts(
-    samples: GradedSamples | MeasuredInnovations,
-) -> Iterator[GradedSamples | MeasuredInnovations]:
+    samples: DefinitiveSamples | MeasuredInnovations,
+) -> Iterator[DefinitiveSamples | MeasuredInnovations]:
     edges = [*range(0, len(samples), MOST_PACKED), len(samples)]
     for first, end in pairwise(edges):
         yield samples.taken(slice(first, end))
 
 
-def _stretch(start: Utc, stretch: GradedStretch) -> GradedStretchInfo:
+def _stretch(start: Utc, stretch: DefinitiveStretch) -> DefinitiveStretchInfo:
     samples = stretch.samples["smoothed"]
     ends = np.asarray((samples.tai_ns[[0, -1]] - start.tai_ns) * 1e-9)
     first, last = texts_of(start, ends)
     good: dict[str, int] = {
         grade: int((stretch.samples[grade].status == Status.GOOD).sum()) for grade in GRADES
     }
-    return GradedStretchInfo(
+    return DefinitiveStretchInfo(
         model=stretch.model, start=first, end=last, samples=len(samples), good=good
     )
 

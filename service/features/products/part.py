@@ -21,7 +21,7 @@ from service.missions.product_settings import MAX_LARGEST_GAP_S
 from service.settings import Settings
 from service.storage.gyro import BlockFilter, count_samples, sample_table
 from service.storage.projections.heads import newest_head
-from service.storage.queries.definitive import count_samples_of, graded_pages
+from service.storage.queries.definitive import count_samples_of, definitive_pages
 from service.storage.queries.histories import retired
 from service.storage.queries.pages import ResultFilter, count
 from service.storage.recording.unsaved_result import LIVE
@@ -131,7 +131,7 @@ class Products:
         """Read recorded attitudes of a period in a grade, page by page."""
         if about.grade == "raw":
             return attitude_pages(self._store.reading, self._store.archive, selected, **wanted)
-        return graded_pages(self._store.reading, selected, about.grade, **wanted)
+        return definitive_pages(self._store.reading, selected, about.grade, **wanted)
 
     def attitude_at(
         self,

@@ -44,7 +44,7 @@ MOST_BLOCKS = 48
 """Largest number of blocks read for a grade: two days at 1 Hz, or spread over longer periods."""
 
 
-class GradedStretchInfo(Struct, frozen=True, kw_only=True):
+class DefinitiveStretchInfo(Struct, frozen=True, kw_only=True):
     """Unbroken stretch of a day's attitude history with one model of motion."""
 
     model: str
@@ -58,7 +58,7 @@ class GradedStretchInfo(Struct, frozen=True, kw_only=True):
 class DaySummary(Struct, frozen=True, kw_only=True):
     """Use of a day's recorded data in the attitude history."""
 
-    stretches: list[GradedStretchInfo]
+    stretches: list[DefinitiveStretchInfo]
     measurements: dict[str, int]
     """Measured attitudes by what became of them: accepted, rejected, started (with it the filter
     began), undecided, unused, unusable (its covariance), alone (too few)."""
@@ -70,7 +70,7 @@ class DaySummary(Struct, frozen=True, kw_only=True):
     """Mean of z^T S^-1 z of the accepted measurements by degrees of freedom: about 1."""
 
 
-def graded_pages(
+def definitive_pages(
     reading: Callable[[], AbstractContextManager[Connection]],
     selected: ResultFilter,
     grade: Grade,

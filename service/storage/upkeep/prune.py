@@ -1,4 +1,4 @@
-"""Pruning: deletes old batches with their results and trends, gyro blocks, and graded days.
+"""Pruning: deletes old batches with their results and trends, gyro blocks, and definitive days.
 
 Each transaction of the writer deletes one hour of a run, or a part of a dense hour: other writes
 run between transactions, and the trends always match the stored batches.
@@ -35,14 +35,14 @@ MOST_BATCHES = 10_000
 _BLOCKS_AT_ONCE = 100
 """Number of gyro blocks deleted in one transaction, of up to 240 kB each."""
 _DAYS_AT_ONCE = 10
-"""Number of graded days deleted in one transaction, of about 12 MB each."""
+"""Number of definitive days deleted in one transaction, of about 12 MB each."""
 
 Conditions = list[ColumnElement[bool]]
 
 
 @dataclass
 class Pruned:
-    """Progress of pruning: batches, gyro blocks and graded days to delete, and deleted."""
+    """Progress of pruning: batches, gyro blocks and definitive days to delete, and deleted."""
 
     total: int
     batches: int = 0
@@ -106,7 +106,7 @@ def _of_run(run: str | None, table: Table, chosen: ColumnElement[bool]) -> Condi
 
 
 def delete_days(connection: Connection, chosen: Conditions) -> int:
-    """Delete a portion of the chosen graded days with their samples; returns its size."""
+    """Delete a portion of the chosen definitive days with their samples; returns its size."""
     ids = list(connection.scalars(select(graded_days.c.id).where(*chosen).limit(_DAYS_AT_ONCE)))
     connection.execute(delete(graded_blocks).where(graded_blocks.c.day_id.in_(ids)))
     chain.note_removed(connection, graded_days, ids)

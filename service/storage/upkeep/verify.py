@@ -20,7 +20,7 @@ from sqlalchemy.exc import DatabaseError
 
 from service.attitude.definitive import (
     GRADES,
-    GradedSamples,
+    DefinitiveSamples,
     MeasuredInnovations,
     unpacked,
     unpacked_innovations,
@@ -99,7 +99,7 @@ def faults_in(
         found += _of_the_trends(engine)
         found += _of_the_gyro_blocks(engine)
         found += _of_the_archived(engine)
-        found += _of_the_grades(engine)
+        found += _of_definitive_days(engine)
     return found
 
 
@@ -388,12 +388,12 @@ def _of_the_archived(engine: sa.Engine) -> Iterator[str]:
         yield f"batch {id}: it is recorded and archived"
 
 
-_UNPACKED: dict[str, Callable[[bytes, int], GradedSamples | MeasuredInnovations]] = {
+_UNPACKED: dict[str, Callable[[bytes, int], DefinitiveSamples | MeasuredInnovations]] = {
     INNOVATIONS: unpacked_innovations
 }
 
 
-def _of_the_grades(engine: sa.Engine) -> Iterator[str]:
+def _of_definitive_days(engine: sa.Engine) -> Iterator[str]:
     """Faults of the days of filtered and smoothed attitudes, a sentence each.
 
     The samples of a current day must be those that were digested, in order of time, within the day
@@ -411,7 +411,7 @@ def _of_a_day(connection: sa.Connection, id: str) -> Iterator[str]:
     if not rows:
         return
     (row,) = rows
-    name = f"graded day {id}"
+    name = f"definitive day {id}"
     c = graded_blocks.c
     if not row["current"]:
         if count(connection, graded_blocks, c.day_id == id):

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from service.features.definitive.day import grade_day
+from service.features.definitive.day import definitive_day
 from service.features.definitive.kernels.inputs import (
     AttitudeMeasurements,
     DirectionMeasurements,
@@ -55,8 +55,8 @@ def recorded_of(gyro_ns, rates, attitudes):
     return later(recorded, NOON_NS - START_NS)
 
 
-def graded(recorded, mission):
-    return grade_day(recorded, mission, NOON.bucket(DAY_S))
+def computed_day(recorded, mission):
+    return definitive_day(recorded, mission, NOON.bucket(DAY_S))
 
 
 def spun(rate_deg_per_s, rng, step_s=10.0, duration_s=900.0, carried=None, wander=0.0):

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from service.attitude.definitive import Status, day_bounds, packed, unpacked
-from service.features.definitive.day import grade_day, window_of
+from service.features.definitive.day import definitive_day, window_of
 from service.features.definitive.kernels.inputs import AttitudeMeasurements, no_attitudes
 from service.features.definitive.stretches import (
     attitudes_where,
@@ -21,7 +21,7 @@ from tests.features.definitive.passes import (
     GYRO,
     MODEL,
     NOON_NS,
-    graded,
+    computed_day,
     later,
     mission_with,
     recorded_of,
@@ -63,7 +63,7 @@ def hours(missions):
     attitudes = attitudes_of(truth, np.arange(0, 10801, 8), SIGMAS, rng)
     kept = (truth.time_s < 5000.0) | (truth.time_s > 5060.0)
     recorded = recorded_of(gyro.tai_ns[kept], gyro.rate_rad_s[kept], attitudes)
-    return truth, graded(recorded, mission_with(missions["XTE"], gyro=GYRO))
+    return truth, computed_day(recorded, mission_with(missions["XTE"], gyro=GYRO))
 
 
 def test_both_grades_have_errors_as_their_covariances_say(hours):
@@ -110,7 +110,7 @@ def test_a_day_does_not_depend_on_what_lies_beyond_its_window(missions, rng):
     gyro, _ = gyro_of(truth, MODEL, rng)
     attitudes = attitudes_of(truth, np.arange(0, 1801, 8), SIGMAS, rng)
     shift = start.tai_ns - 900 * 10**9 - NOON_NS
-    found = grade_day(
+    found = definitive_day(
         later(recorded_of(gyro.tai_ns, gyro.rate_rad_s, attitudes), shift), mission, day
     )
     (stretch,) = found.stretches
@@ -126,7 +126,7 @@ def test_without_a_gyro_the_rate_is_taken_for_constant(rng):
     truth = truth_of(lambda t: np.tile([0.0, -1e-3, 0.0], (len(t), 1)), 900.0)
     attitudes = attitudes_of(truth, np.arange(0, 901, 5), SIGMAS, rng)
     mission = mission_with(mission_without_gyro("XTE"), motion={"rate_walk_rad_s1_5": 1e-7})
-    day = graded(recorded_of([], np.zeros((0, 3)), attitudes), mission)
+    day = computed_day(recorded_of([], np.zeros((0, 3)), attitudes), mission)
     (stretch,) = day.stretches
     assert stretch.model == "constant_rate"
     samples = stretch.samples["smoothed"]
@@ -144,7 +144,7 @@ def test_samples_of_a_gyro_that_the_mission_does_not_describe_are_not_used(rng):
     truth = truth_of(slews, 600.0)
     gyro, _ = gyro_of(truth, MODEL, rng)
     attitudes = attitudes_of(truth, np.arange(0, 601, 8), SIGMAS, rng)
-    day = graded(
+    day = computed_day(
         recorded_of(gyro.tai_ns, gyro.rate_rad_s, attitudes),
         mission_without_gyro("SWAS"),
     )
@@ -157,7 +157,7 @@ def test_a_long_gap_of_the_gyro_is_bridged_at_a_constant_rate(missions, rng):
     attitudes = attitudes_of(truth, np.arange(0, 7201, 8), SIGMAS, rng)
     kept = (truth.time_s < 2000.0) | (truth.time_s > 4000.0)
     recorded = recorded_of(gyro.tai_ns[kept], gyro.rate_rad_s[kept], attitudes)
-    day = graded(recorded, mission_with(missions["XTE"], gyro=GYRO))
+    day = computed_day(recorded, mission_with(missions["XTE"], gyro=GYRO))
     assert [each.model for each in day.stretches] == ["gyro", "constant_rate", "gyro"]
     for before, after in zip(day.stretches[:-1], day.stretches[1:], strict=True):
         assert before.samples["smoothed"].tai_ns[-1] < after.samples["smoothed"].tai_ns[0]
@@ -172,11 +172,11 @@ def test_axes_steps_and_the_moment_of_samples_are_the_mission_s(missions, rng):
     axes = {"axes": ["-X", "Z", "Y"]}
     sent = gyro.rate_rad_s * [-1.0, 1.0, 1.0]
     sent = sent[:, [0, 2, 1]]
-    same = graded(
+    same = computed_day(
         recorded_of(gyro.tai_ns, gyro.rate_rad_s, attitudes),
         mission_with(missions["XTE"], gyro=GYRO),
     )
-    other = graded(
+    other = computed_day(
         recorded_of(gyro.tai_ns, sent, attitudes), mission_with(missions["XTE"], gyro=GYRO | axes)
     )
     one, two = (each.stretches[0].samples["smoothed"] for each in (same, other))
@@ -185,7 +185,7 @@ def test_axes_steps_and_the_moment_of_samples_are_the_mission_s(missions, rng):
     # A median step of .25 s: nothing is a gap, though all is finer than a second.
     assert same.gyro == {"samples": 4801, "gaps": 0, "beyond_largest": 0, "not_given": 0}
     # Of a steady turn the instant and the mean are the same; of its beginning they are not.
-    instants = graded(
+    instants = computed_day(
         recorded_of(gyro.tai_ns, gyro.rate_rad_s, attitudes),
         mission_with(missions["XTE"], gyro=GYRO | {"samples": "instant"}),
     )
@@ -199,7 +199,7 @@ def test_samples_beyond_the_largest_rate_are_left_out_and_counted(missions, rng)
     rates = gyro.rate_rad_s.copy()
     rates[100:103] = 1.0
     attitudes = attitudes_of(truth, np.arange(0, 601, 8), SIGMAS, rng)
-    day = graded(
+    day = computed_day(
         recorded_of(gyro.tai_ns, rates, attitudes), mission_with(missions["XTE"], gyro=GYRO)
     )
     assert day.gyro == {"samples": 601, "gaps": 1, "beyond_largest": 3, "not_given": 0}
@@ -214,7 +214,7 @@ def test_a_tracker_that_is_wrong_for_an_hour_does_no_harm_to_good_attitudes(miss
     wrong = (rows > 3600) & (rows <= 7200)
     offset = np.where(wrong[:, None], np.array([0.0, 400.0, 0.0]) * ARCSEC, 0.0)
     attitudes = attitudes_of(truth, rows, SIGMAS, rng, offset=offset)
-    day = graded(
+    day = computed_day(
         recorded_of(gyro.tai_ns, gyro.rate_rad_s, attitudes),
         mission_with(missions["XTE"], gyro=GYRO),
     )
@@ -244,7 +244,7 @@ def test_a_step_of_the_clock_is_named_by_the_status(missions, rng):
             attitudes.tai_ns + at, attitudes.quaternion, attitudes.covariance_rad2
         ),
     )
-    day = graded(recorded, mission_with(missions["XTE"], gyro=GYRO))
+    day = computed_day(recorded, mission_with(missions["XTE"], gyro=GYRO))
     samples = day.stretches[0].samples["smoothed"]
     ns = samples.tai_ns - NOON_NS
     moved = ns >= 1801 * 10**9
@@ -269,12 +269,12 @@ def test_attitudes_whose_covariance_says_nothing_are_left_out():
 def test_measurements_that_cannot_confirm_an_attitude_are_counted(missions, rng):
     truth = truth_of(slews, 600.0)
     attitudes = attitudes_of(truth, np.array([0, 300]), SIGMAS, rng)
-    day = graded(recorded_of([], np.zeros((0, 3)), attitudes), missions["XTE"])
+    day = computed_day(recorded_of([], np.zeros((0, 3)), attitudes), missions["XTE"])
     assert (day.samples, day.measurements["alone"]) == (0, 2)
 
 
 def test_nothing_recorded_gives_nothing(missions):
-    day = graded(recorded_of([], np.zeros((0, 3)), no_attitudes()), missions["XTE"])
+    day = computed_day(recorded_of([], np.zeros((0, 3)), no_attitudes()), missions["XTE"])
     assert (day.samples, day.stretches, day.nis_per_degree) == (0, [], None)
 
 
@@ -318,7 +318,7 @@ def test_settings_of_a_gyro_have_bounds():
 def test_a_spinning_body_has_the_rates_that_its_batches_carried(rng, spin):
     """At 36 deg/s, with a batch every ten seconds, a body looks still; at 24 it looks reversed."""
     truth, rows, recorded, own = spun(spin, rng)
-    (stretch,) = graded(recorded, mission_without_gyro("XTE")).stretches
+    (stretch,) = computed_day(recorded, mission_without_gyro("XTE")).stretches
     for samples in stretch.samples.values():
         assert (samples.status[10:] == Status.GOOD).all()
         np.testing.assert_allclose(samples.rate_deg_per_s[5:-1], own[5:-1], atol=0.02)
@@ -330,7 +330,7 @@ def test_a_spinning_body_has_the_rates_that_its_batches_carried(rng, spin):
 def test_rates_that_are_a_little_off_are_corrected_along_the_spin(rng):
     """Across it, a constant error turns with the body: one turn a step leaves nothing of it."""
     _, _, recorded, own = spun((0.0, 0.0, 36.0), rng, carried=(0.0, 0.02, 36.03))
-    (stretch,) = graded(recorded, mission_without_gyro("XTE")).stretches
+    (stretch,) = computed_day(recorded, mission_without_gyro("XTE")).stretches
     rates = stretch.samples["smoothed"].rate_deg_per_s
     np.testing.assert_allclose(rates[5:-1, 2], own[5:-1, 2], atol=0.01)
     np.testing.assert_allclose(rates[5:-1, :2], own[5:-1, :2], atol=0.03)
@@ -343,7 +343,7 @@ def test_random_spinners_are_smoothed_at_their_own_rates(rng):
         spin = rng.uniform(0.0, 60.0) * axis / np.linalg.norm(axis)
         step_s = float(rng.choice([1.0, 2.5, 10.0, 30.0, 60.0]))
         truth, rows, recorded, own = spun(spin, rng, step_s, 40 * step_s, wander=0.02)
-        (stretch,) = graded(recorded, mission_without_gyro("XTE")).stretches
+        (stretch,) = computed_day(recorded, mission_without_gyro("XTE")).stretches
         samples = stretch.samples["smoothed"]
         found = Rotation.from_quat(samples.quaternion)
         e = (found.inv() * truth.attitude[rows]).as_rotvec()
@@ -357,7 +357,7 @@ def test_rates_of_a_body_that_turns_little_change_nothing(rng):
     _, _, recorded, _ = spun((0.0, 0.0, 0.2), rng)
     mission = mission_without_gyro("XTE")
     with_rates, without = (
-        graded(r, mission) for r in (recorded, replace(recorded, carried_rad_s=None))
+        computed_day(r, mission) for r in (recorded, replace(recorded, carried_rad_s=None))
     )
     for grade in ("filtered", "smoothed"):
         pair = (each.stretches[0].samples[grade] for each in (with_rates, without))
@@ -372,7 +372,7 @@ def test_zeros_of_a_gyro_while_the_body_turns_are_none(missions, rng):
     off = (truth.time_s >= 1000.0) & (truth.time_s < 2800.0)
     rates = np.where(off[:, None], 0.0, gyro.rate_rad_s)
     mission = mission_with(missions["XTE"], gyro=GYRO)
-    day = graded(recorded_of(gyro.tai_ns, rates, attitudes), mission)
+    day = computed_day(recorded_of(gyro.tai_ns, rates, attitudes), mission)
     assert day.gyro["not_given"] == np.count_nonzero(off)
     assert [each.model for each in day.stretches] == ["gyro", "constant_rate", "gyro"]
     for stretch in day.stretches:
@@ -382,7 +382,7 @@ def test_zeros_of_a_gyro_while_the_body_turns_are_none(missions, rng):
         assert (samples.status == Status.GOOD).mean() > 0.9
     still = truth_of(inertial_hold, 3600.0)
     attitudes = attitudes_of(still, np.arange(0, 3601, 8), SIGMAS, rng)
-    day = graded(recorded_of(still.tai_ns, np.zeros((3601, 3)), attitudes), mission)
+    day = computed_day(recorded_of(still.tai_ns, np.zeros((3601, 3)), attitudes), mission)
     assert day.gyro["not_given"] == 0
     assert [each.model for each in day.stretches] == ["gyro"]
 
@@ -395,7 +395,7 @@ def test_zeros_of_a_gyro_take_nothing_from_the_rates_of_a_spinning_body(
     truth, rows, recorded, own = spun((0.0, 0.0, spin_deg_per_s), rng)
     gyro_ns = np.arange(NOON_NS, recorded.attitudes.tai_ns[-1] + 1, 10**9)
     off = replace(recorded, gyro_ns=gyro_ns, rates_rad_s=np.zeros((len(gyro_ns), 3)))
-    day = graded(off, mission_with(missions["XTE"], gyro=GYRO))
+    day = computed_day(off, mission_with(missions["XTE"], gyro=GYRO))
     assert day.gyro["not_given"] == len(gyro_ns)
     (stretch,) = day.stretches
     assert stretch.model == "constant_rate"
@@ -410,7 +410,9 @@ def test_zeros_of_a_gyro_stand_where_batches_carry_the_noise_of_a_body_at_rest(m
     attitudes = attitudes_of(still, np.arange(0, 901, 10), SIGMAS, rng)
     recorded = recorded_of(still.tai_ns, np.zeros((901, 3)), attitudes)
     noise = np.radians(rng.normal(0.0, 0.05, (91, 3)))
-    day = graded(replace(recorded, carried_rad_s=noise), mission_with(missions["XTE"], gyro=GYRO))
+    day = computed_day(
+        replace(recorded, carried_rad_s=noise), mission_with(missions["XTE"], gyro=GYRO)
+    )
     assert day.gyro["not_given"] == 0
     assert [each.model for each in day.stretches] == ["gyro"]
 
@@ -423,7 +425,7 @@ def test_batches_of_one_moment_have_an_attitude_whatever_rates_they_carry(rng):
         attitudes=attitudes_where(recorded.attitudes, [0] * 6),
         carried_rad_s=recorded.carried_rad_s[:6],
     )
-    (stretch,) = graded(one, mission_without_gyro("XTE")).stretches
+    (stretch,) = computed_day(one, mission_without_gyro("XTE")).stretches
     samples = stretch.samples["smoothed"]
     assert len(samples) == 1
     assert np.isfinite(samples.covariance_arcsec2).all()

@@ -16,7 +16,7 @@ from tests.features.definitive.passes import (
     MODEL,
     NOON,
     NOON_NS,
-    graded,
+    computed_day,
     mission_with,
     recorded_of,
 )
@@ -46,7 +46,7 @@ def found(missions):
     attitudes = turned(
         attitudes_of(truth, np.arange(0, HOURS * 3600 + 1, 8), SIGMAS, rng), 700, 300.0
     )
-    day = graded(
+    day = computed_day(
         recorded_of(gyro.tai_ns, gyro.rate_rad_s, attitudes),
         mission_with(missions["XTE"], gyro=GYRO),
     )

@@ -15,7 +15,7 @@ import pytest
 from service.errors import Busy, NotFound
 from service.features.definitive import inputs as recorded_inputs
 from service.features.definitive.carried import CarriedFilter, live_window
-from service.features.definitive.day import grade_day, window_of
+from service.features.definitive.day import definitive_day, window_of
 from service.features.definitive.inputs import recorded_in
 from service.features.definitive.kernels.inputs import AttitudeMeasurements
 from service.features.definitive.live_filter import LiveFilter
@@ -86,7 +86,7 @@ def test_in_portions_it_gives_the_last_filtered_attitude_of_the_day(missions, ha
             none = recorded.gyro_ns[:0], recorded.rates_rad_s[:0]
             recorded = replace(recorded, gyro_ns=none[0], rates_rad_s=none[1])
         found = carried.carry_on(recorded, mission)
-        (stretch,) = grade_day(recorded, mission, NOON.bucket(DAY_S)).stretches
+        (stretch,) = definitive_day(recorded, mission, NOON.bucket(DAY_S)).stretches
         whole = stretch.samples["filtered"]
         assert found.model == stretch.model
         last = replace(found, sample=whole.taken(slice(-1, None)))
@@ -211,7 +211,7 @@ def test_it_depends_on_the_six_hours_before_the_hour_of_the_latest_batch(live, m
     def last_of(window):
         with live.store.reading() as connection:
             found = recorded_in(connection, live.sky, "XTE", "live", *window)
-        (stretch,) = grade_day(found, mission, day).stretches
+        (stretch,) = definitive_day(found, mission, day).stretches
         return stretch.samples["filtered"].taken(slice(-1, None))
 
     def latest():
@@ -392,7 +392,7 @@ def test_rates_of_recorded_batches_lead_a_spinning_body_through_the_day_and_live
         found = recorded_in(connection, live.sky, "XTE", "live", *window)
     np.testing.assert_allclose(np.degrees(found.carried_rad_s), [rate_deg_per_s] * 41, rtol=1e-12)
     mission = live.context.missions["XTE"]
-    (stretch,) = grade_day(found, mission, NOON.bucket(DAY_S)).stretches
+    (stretch,) = definitive_day(found, mission, NOON.bucket(DAY_S)).stretches
     carried = CarriedFilter().carry_on(found, mission)
     assert (stretch.model, carried.model) == ("constant_rate", "constant_rate")
     for rates in (stretch.samples["smoothed"].rate_deg_per_s[5:], carried.sample.rate_deg_per_s):

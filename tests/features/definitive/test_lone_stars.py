@@ -9,7 +9,14 @@ from scipy.spatial.transform import Rotation
 from service.attitude.definitive import Status
 from service.features.definitive.kernels.inputs import DirectionMeasurements
 from service.vectors import ARCSEC_PER_RADIAN
-from tests.features.definitive.passes import GYRO, MODEL, NOON_NS, graded, mission_with, recorded_of
+from tests.features.definitive.passes import (
+    GYRO,
+    MODEL,
+    NOON_NS,
+    computed_day,
+    mission_with,
+    recorded_of,
+)
 from tests.features.definitive.simulated import (
     ARCSEC,
     START_NS,
@@ -44,7 +51,7 @@ def one_star_each(truth, rows, rng):
 
 def filtered(recorded, mission):
     """The filtered samples of a pass of one stretch."""
-    (stretch,) = graded(recorded, mission).stretches
+    (stretch,) = computed_day(recorded, mission).stretches
     return stretch.samples["filtered"]
 
 

@@ -1,4 +1,4 @@
-"""The page of grades and its route: what the record says of attitude over time, and of nothing."""
+"""The page of the definitive attitude and its route: what the record says, and of nothing."""
 
 import html
 import re
@@ -11,7 +11,7 @@ import pytest
 
 from service.app.factory import open_app
 from service.attitude.definitive import Status
-from service.features.definitive.charts import direction_chart, grade_charts
+from service.features.definitive.charts import definitive_charts, direction_chart
 from service.features.definitive.part import Definitive
 from service.missions.mission import load_missions
 from service.times import parse_utc, shifted
@@ -104,7 +104,7 @@ def test_the_scale_of_sigmas_is_that_of_good_attitudes(tmp_path, missions):
         app.part(Definitive).days.smooth("XTE")
         axis = TimeAxis(NOON, shifted(NOON, 1800.0))
         found = app.part(Definitive).days.of_period("XTE", "live", axis.start, axis.end)
-        (chart,) = [each for each in grade_charts(found, axis) if each.id == "sigma"]
+        (chart,) = [each for each in definitive_charts(found, axis) if each.id == "sigma"]
     finally:
         app.close()
     sigma_arcsec = np.sqrt(found.samples["filtered"].covariance_arcsec2[:, [0, 3, 5]])

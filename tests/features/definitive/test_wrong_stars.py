@@ -9,7 +9,14 @@ from service.attitude.solution import AttitudeSolution, solve_attitude
 from service.features.definitive.kernels.inputs import AttitudeMeasurements
 from service.vectors import ARCSEC_PER_RADIAN, unit
 from tests.chance import at_least, at_most
-from tests.features.definitive.passes import GYRO, MODEL, NOON_NS, graded, mission_with, recorded_of
+from tests.features.definitive.passes import (
+    GYRO,
+    MODEL,
+    NOON_NS,
+    computed_day,
+    mission_with,
+    recorded_of,
+)
 from tests.features.definitive.simulated import ARCSEC, gyro_of, slews, squares, truth_of
 from tests.scale import size
 
@@ -73,7 +80,7 @@ def test_wrong_stars_and_wrong_attitudes_make_no_good_attitude_wrong(missions, s
     for _ in range(passes):
         gyro, _ = gyro_of(truth, MODEL, rng)
         attitudes, wrong = measured(truth, rows, rng)
-        day = graded(recorded_of(gyro.tai_ns, gyro.rate_rad_s, attitudes), mission)
+        day = computed_day(recorded_of(gyro.tai_ns, gyro.rate_rad_s, attitudes), mission)
         told["wrong"] += wrong
         told["rejected"] += day.measurements["rejected"]
         (stretch,) = day.stretches
