@@ -17,12 +17,11 @@ from service.errors import BadBatch, Fault, NotFound, shown_value
 from service.feature import SETTING, feature_modules, features_on
 from service.missions.faults import plain_message
 from service.missions.mission import Mission, mission_named
-from service.observations.schema import RunName
+from service.observations.schema import LIVE, RunName
 from service.settings import Settings
 from service.sky.model import SkyModel
 from service.storage.queries.histories import Retired
 from service.storage.recording.ids import is_ulid
-from service.storage.recording.unsaved_result import LIVE
 from service.storage.store import Store
 from service.times import Utc, utc_now
 from service.trends.quantities import limited_trackers

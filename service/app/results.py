@@ -20,7 +20,7 @@ from service.ingest.compare_options import ComparedSample, Pair, RunManyAgain, c
 from service.ingest.solver_pool import mission_in_input
 from service.ingest.submit import SubmissionService
 from service.missions.mission import Mission, mission_named
-from service.observations.schema import OptionsIn, submission_from_json
+from service.observations.schema import LIVE, OptionsIn, submission_from_json
 from service.storage.queries import results
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.period import PeriodStars, period_stars, sample_period
@@ -40,7 +40,7 @@ from service.storage.queries.star_field import StarField, star_field_of, tracker
 from service.storage.queries.time_buckets import BucketFilter
 from service.storage.recording.ids import is_ulid
 from service.storage.recording.signatures import signature_of
-from service.storage.recording.unsaved_result import LIVE, Answered
+from service.storage.recording.unsaved_result import Answered
 from service.storage.sql.columns import Row
 from service.times import Utc, utc_now
 

@@ -15,11 +15,11 @@ from service.ingest.reprocess import ReprocessPlan, ReprocessProgress, reprocess
 from service.ingest.solver_pool import Solver
 from service.ingest.worker_process import WorkerConfig
 from service.missions.mission import Mission, mission_named
+from service.observations.schema import LIVE
 from service.storage.queries import fleet, histories
 from service.storage.queries.compare_runs import changed_batches, compare_runs, run_rates
 from service.storage.queries.pages import ResultFilter
 from service.storage.recording.results import set_run_alarms
-from service.storage.recording.unsaved_result import LIVE
 from service.storage.upkeep.forget import ForgetFilter, forget, found
 from service.storage.upkeep.reprocessing import Reprocessing, reprocessings
 from service.times import Utc, utc_now

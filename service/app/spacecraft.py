@@ -21,13 +21,13 @@ from service.gyro.blocks import GyroBlock, block_from_json, require_rates_within
 from service.ingest.solver_pool import mission_in_input
 from service.missions.mission import Mission, mission_named
 from service.missions.motion import largest_rate_deg_per_s
+from service.observations.schema import LIVE
 from service.storage import gyro as blocks
 from service.storage.queries import fleet, histories, time_buckets, trends
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.trends import worst_batches
 from service.storage.recording.ids import Ulids
 from service.storage.recording.result_metrics import is_waiting
-from service.storage.recording.unsaved_result import LIVE
 from service.storage.sql.columns import Row
 from service.table_files.table import Column, Table
 from service.table_files.table import Page as TablePage

@@ -14,7 +14,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from service.errors import BadBatch, Conflict, Fault, shown_value
 from service.observations.field_faults import checked_by
-from service.observations.schema import Key, Number, RunName, Wire, is_time
+from service.observations.schema import LIVE, Key, Number, RunName, Wire, is_time
 from service.times import DAY_S, Utc, parse_utc, shifted
 from service.vectors import Vector, read_only
 
@@ -157,7 +157,7 @@ class GyroBlockIn(Wire):
         Key, Field(description="Names the block; unique for the spacecraft and the run.")
     ]
     start: Annotated[str, AfterValidator(is_time), Field(description="UTC of the first sample.")]
-    run: RunName = "live"
+    run: RunName = LIVE
     step_s: Annotated[
         Annotated[Number, Field(ge=MIN_STEP_S, le=MAX_SPAN_S)] | None,
         Field(description="From each sample to the next; in place of `times_s`."),

@@ -55,7 +55,7 @@ class FrameIn(schema.Wire):
 
     batch: schema.Key | None = None
     time: Annotated[str, AfterValidator(schema.is_time)] | None = None
-    run: schema.RunName = "live"
+    run: schema.RunName = schema.LIVE
     tracker: schema.Key | None = None
     a_priori: schema.APrioriIn | None = None
     body_rates_deg_per_s: tuple[schema.BodyRate, schema.BodyRate, schema.BodyRate] = (0.0, 0.0, 0.0)

@@ -27,7 +27,7 @@ from service.errors import AcquisitionError, BeingBuilt, Busy, Stopping
 from service.ingest.missions_in_force import MissionsInForce
 from service.ingest.solver_pool import WAIT_S, Solver, SolverPool, SolverTask
 from service.ingest.tracking import predicted_from, with_prediction
-from service.observations.schema import Submission
+from service.observations.schema import LIVE, Submission
 from service.sky.cache import NotAtHand
 from service.storage.recording.identity import (
     ExistingResult,
@@ -37,7 +37,7 @@ from service.storage.recording.identity import (
     look_up,
     remember_keys,
 )
-from service.storage.recording.unsaved_result import LIVE, Answered, PredictedFrom, UnsavedResult
+from service.storage.recording.unsaved_result import Answered, PredictedFrom, UnsavedResult
 from service.storage.recording.writer import RETRY_AFTER_S, WriteOutcome, WriterState
 from service.storage.store import Store
 from service.times import Utc, utc_now

@@ -21,9 +21,9 @@ from service.ingest.solver_pool import Solver
 from service.ingest.tracking import tracked_again
 from service.ingest.worker_process import WorkerConfig
 from service.missions.mission import Mission
-from service.observations.schema import BatchIn, OptionsIn, Submission, submission_from_model
+from service.observations.schema import LIVE, BatchIn, OptionsIn, Submission, submission_from_model
 from service.storage.queries.pages import PLACE, ResultFilter
-from service.storage.recording.unsaved_result import LIVE, Answered, UnsavedResult
+from service.storage.recording.unsaved_result import Answered, UnsavedResult
 from service.storage.sql.statements import insert_runs
 from service.storage.sql.tables import archived_batches, batches, results, runs
 from service.storage.store import Store

@@ -54,6 +54,8 @@ def is_time(text: str) -> str:
 Key = Annotated[str, Field(min_length=1, max_length=128, pattern=r"^[^\x00-\x1f\x7f]+$")]
 """Looser pattern for looking up names: records of earlier versions hold some that are no `Name`."""
 Name = Annotated[str, Field(min_length=1, max_length=128, pattern=NAME_PATTERN)]
+LIVE = "live"
+"""Run of the batches that pipelines send."""
 RunName = Annotated[
     str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.:-]*$")
 ]
@@ -411,7 +413,7 @@ class BatchIn(Wire):
     spacecraft: Name
     batch: Name
     time: Annotated[str, AfterValidator(is_time)]
-    run: RunName = "live"
+    run: RunName = LIVE
     measurement: MeasurementIn | None = None
     a_priori: Annotated[APrioriIn | None, AfterValidator(none_beside_measurement)]
     body_rates_deg_per_s: tuple[BodyRate, BodyRate, BodyRate] = (0.0, 0.0, 0.0)

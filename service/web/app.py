@@ -31,9 +31,9 @@ from service.web.api import (
     probes,
     runs,
     spacecraft,
+    tokens,
     zones,
 )
-from service.web.api import tokens as access
 from service.web.console import console_router
 from service.web.console.page import page_or_problem
 from service.web.event_stream import Live
@@ -61,7 +61,7 @@ ROUTERS: tuple[APIRouter, ...] = (
     spacecraft.overview_router,
     annotations.router,
     events.router,
-    access.router,
+    tokens.router,
     probes.router,
 )
 

@@ -41,7 +41,7 @@ from service.ingest.submit import SubmissionService
 from service.intervals import Interval
 from service.missions.mission import Mission
 from service.observations.batch import ObservationBatch
-from service.observations.schema import TolerancesIn
+from service.observations.schema import LIVE, TolerancesIn
 from service.sky.catalog.run_catalog import RunCatalog
 from service.storage.queries.definitive import latest_innovations
 from service.storage.queries.pages import ResultFilter, latest_time
@@ -49,7 +49,6 @@ from service.storage.queries.period import sample_period
 from service.storage.queries.results import BatchSample, sample_batches
 from service.storage.queries.time_buckets import BucketFilter
 from service.storage.queries.trends import latest_prior_errors
-from service.storage.recording.unsaved_result import LIVE
 from service.times import DAY_S, Utc, recorded_utc, shifted, utc_now
 
 ADVICE_SAMPLE = 200

@@ -14,10 +14,10 @@ from service.features.alarms.projection import evaluate_by_clock, is_due_by_cloc
 from service.features.alarms.state import StateFilter, TimeOut, alarm_spans, list_alarms, times_out
 from service.features.alarms.windows import Preview, preview_of, preview_of_gaps
 from service.missions.mission import Mission, mission_named
+from service.observations.schema import LIVE
 from service.storage.queries.definitive import rejected_samples
 from service.storage.queries.pages import ResultFilter, latest_time
 from service.storage.queries.trends import latest_samples
-from service.storage.recording.unsaved_result import LIVE
 from service.storage.sql.columns import Row
 from service.times import DAY_S, Utc, shifted, utc_now
 from service.trends.limits import LimitSettings, Sample

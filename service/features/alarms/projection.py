@@ -16,12 +16,12 @@ from service.features.alarms.state import change, limits_of
 from service.features.alarms.tables import alarms, watches
 from service.features.alarms.windows import BatchRef, Point, SampleWindow
 from service.missions.mission import Mission
+from service.observations.schema import LIVE
 from service.storage.projections.rollups import RecordedResult
 from service.storage.queries.pages import ResultFilter, newest
 from service.storage.queries.results import recorded_mission
 from service.storage.recording.ids import Ulids
 from service.storage.recording.results import runs_with_alarms
-from service.storage.recording.unsaved_result import LIVE
 from service.storage.sql.columns import Row
 from service.storage.sql.statements import insert_missing, prepared
 from service.storage.sql.tables import batches, results

@@ -40,9 +40,9 @@ from service.ingest.submit import SubmissionService
 from service.missions.mission import Calibration as FocalPlaneSettings
 from service.missions.mission import Magnitudes, Mission, Tracker
 from service.observations.batch import ObservationBatch
+from service.observations.schema import LIVE
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.results import sample_batches
-from service.storage.recording.unsaved_result import LIVE
 from service.times import Utc
 from service.vectors import ARCSEC_PER_RADIAN, Matrix, Vector
 

@@ -17,8 +17,8 @@ from service.features.calibration.part import Calibrations
 from service.features.calibration.records import Calibration, CalibrationSummary
 from service.ingest.missions_in_force import geometry_of
 from service.missions.mission import AS_MEASURED, Mission
+from service.observations.schema import LIVE
 from service.sky.catalog.run_catalog import UNKNOWN_COLOR_BV_MAG
-from service.storage.recording.unsaved_result import LIVE
 from service.vectors import ARCSEC_PER_RADIAN
 from service.web.console.page import ContextDep, FromQuery, PageContext, PageQuery, console_page
 from service.web.requests.access import Policy

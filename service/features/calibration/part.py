@@ -38,8 +38,8 @@ from service.features.calibration.records import (
 from service.ingest.missions_in_force import with_geometry
 from service.ingest.submit import SubmissionService
 from service.missions.mission import Mission, mission_named
+from service.observations.schema import LIVE
 from service.storage.recording.ids import Ulids
-from service.storage.recording.unsaved_result import LIVE
 from service.storage.sql.columns import Row
 from service.times import Utc, utc_now
 

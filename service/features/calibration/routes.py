@@ -16,7 +16,7 @@ from service.features.calibration import records as models
 from service.features.calibration.estimates import CALIBRATION_SAMPLE, CalibrationRequest
 from service.features.calibration.linearise import LARGEST_DEGREE
 from service.features.calibration.part import Calibrations
-from service.observations.schema import Key, RunName, Wire
+from service.observations.schema import LIVE, Key, RunName, Wire
 from service.web.api.batches import COMPARISON_S, SampleSize
 from service.web.openapi import LINK, LOCATION, ApiRouter, Returns
 from service.web.requests import query_parameters as params
@@ -53,7 +53,7 @@ class CalibrationIn(_Period):
     """Request body for a calibration: the parameters to estimate and the batches to use."""
 
     spacecraft: Key
-    run: RunName = "live"
+    run: RunName = LIVE
     trackers: Annotated[
         tuple[Key, ...],
         Field(max_length=16, description="The first is the reference; empty: all of the mission."),

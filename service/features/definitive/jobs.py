@@ -14,8 +14,8 @@ from service.features.definitive.day import LOOK_AHEAD_S
 from service.features.definitive.days import DefinitiveDays, SmoothProgress
 from service.features.definitive.records import DefinitiveJob
 from service.missions.mission import mission_named
+from service.observations.schema import LIVE
 from service.storage.recording.ids import Ulids
-from service.storage.recording.unsaved_result import LIVE
 from service.times import DAY_S, Utc, bucket_start, shifted, utc_now
 
 log = logging.getLogger(__name__)

@@ -15,9 +15,9 @@ from service.features.definitive.carried import CarriedFilter, live_window
 from service.features.definitive.inputs import RatesRead, recorded_in
 from service.features.definitive.records import LiveAttitude, live_attitude
 from service.missions.mission import mission_named
+from service.observations.schema import LIVE
 from service.storage.queries.pages import ResultFilter, newest
 from service.storage.recording.events import last_event
-from service.storage.recording.unsaved_result import LIVE
 from service.storage.sql.tables import audit, batches, gyro_blocks, results
 from service.times import DAY_S, recorded_utc, utc_now
 

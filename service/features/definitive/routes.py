@@ -10,7 +10,7 @@ from starlette.responses import Response
 
 from service.features.definitive import records
 from service.features.definitive.part import Definitive
-from service.observations.schema import RunName, Wire
+from service.observations.schema import LIVE, RunName, Wire
 from service.web.openapi import LINK, LOCATION, ApiRouter, Returns
 from service.web.requests import query_parameters as params
 from service.web.requests.access import (
@@ -59,7 +59,7 @@ def list_innovations(
 class DefinitiveIn(Wire):
     """Request body for definitive attitudes: run, period and author."""
 
-    run: RunName = "live"
+    run: RunName = LIVE
     start: params.Start = None
     end: params.End = None
     who: Who = None

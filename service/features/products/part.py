@@ -18,13 +18,13 @@ from service.features.products.result_tables import attitude_pages, batch_table,
 from service.ingest.missions_in_force import adopted_missions
 from service.missions.mission import Mission, load_missions, mission_named
 from service.missions.product_settings import MAX_LARGEST_GAP_S
+from service.observations.schema import LIVE
 from service.settings import Settings
 from service.storage.gyro import BlockFilter, count_samples, sample_table
 from service.storage.projections.heads import newest_head
 from service.storage.queries.definitive import count_samples_of, definitive_pages
 from service.storage.queries.histories import retired
 from service.storage.queries.pages import ResultFilter, count
-from service.storage.recording.unsaved_result import LIVE
 from service.storage.store import Store
 from service.table_files.table import Table
 from service.times import Utc, shifted, utc_now

@@ -13,8 +13,8 @@ from service.features.tracks.finding import Track as FoundTrack
 from service.features.tracks.finding import figures, find_tracks
 from service.features.tracks.linking import Batches, Points
 from service.features.tracks.tdm import TrackedObject, write_tdm
+from service.observations.schema import LIVE
 from service.storage.queries.pages import ResultFilter
-from service.storage.recording.unsaved_result import LIVE
 from service.times import Utc, shifted, utc_now
 from service.vectors import to_ra_dec
 

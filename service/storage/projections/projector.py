@@ -23,6 +23,7 @@ from sqlalchemy import Connection, select, update
 
 from service.errors import BadConfiguration, Busy
 from service.feature import feature_modules
+from service.observations.schema import LIVE
 from service.storage.projections import rollups, seals
 from service.storage.projections.heads import NOTHING, HeadMaker
 from service.storage.projections.rollups import RecordedResult, lock_position, recorded_after
@@ -30,7 +31,7 @@ from service.storage.queries.pages import newest_first
 from service.storage.recording import events
 from service.storage.recording.answer import state_in
 from service.storage.recording.chain import Statement
-from service.storage.recording.unsaved_result import AHEAD_NS, LIVE, STARS
+from service.storage.recording.unsaved_result import AHEAD_NS, STARS
 from service.storage.recording.writer import is_of_the_database, is_of_the_statement
 from service.storage.sql.columns import Row, unpack
 from service.storage.sql.dialects import dialect_of, next_transaction

@@ -23,9 +23,10 @@ from sqlalchemy import (
     select,
 )
 
+from service.observations.schema import LIVE
 from service.storage.queries.time_buckets import TRENDS, Bucket, Trend
 from service.storage.recording import result_metrics
-from service.storage.recording.unsaved_result import AHEAD_NS, LIVE
+from service.storage.recording.unsaved_result import AHEAD_NS
 from service.storage.sql import tables
 from service.storage.sql.columns import Row
 from service.storage.sql.statements import add_rollups, insert_all, prepared

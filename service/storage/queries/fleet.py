@@ -14,6 +14,7 @@ from service.contract.alarms import Alarm, AlarmSummary
 from service.contract.answers import Summary
 from service.contract.spacecraft import Overview, OverviewRow, Sparkline, WindowCounts
 from service.missions.mission import Mission
+from service.observations.schema import LIVE
 from service.storage.queries import time_buckets
 from service.storage.queries.histories import live_state
 from service.storage.queries.pages import newest_first
@@ -21,7 +22,7 @@ from service.storage.queries.results import summary_of, summary_query
 from service.storage.queries.time_buckets import BucketFilter
 from service.storage.queries.trends import latest_time_of
 from service.storage.recording.result_metrics import SUMMED
-from service.storage.recording.unsaved_result import AHEAD_NS, LIVE
+from service.storage.recording.unsaved_result import AHEAD_NS
 from service.storage.sql import tables
 from service.storage.sql.columns import Row
 from service.storage.sql.tables import COUNTS, batches, results

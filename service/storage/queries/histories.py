@@ -15,12 +15,12 @@ from service.contract.base import Page
 from service.contract.runs import Run
 from service.contract.spacecraft import AttitudeRow, MissionThen, SpacecraftRow
 from service.missions.mission import Mission
+from service.observations.schema import LIVE
 from service.storage.archive.reading import Archive
 from service.storage.queries import pages
 from service.storage.queries.pages import MOST_OPENED, Listing
 from service.storage.queries.results import summary_of, summary_query
 from service.storage.recording.answer import state_in
-from service.storage.recording.unsaved_result import LIVE
 from service.storage.sql.tables import (
     batches,
     mission_uses,

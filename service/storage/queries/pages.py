@@ -16,9 +16,10 @@ from sqlalchemy import ColumnElement, Connection, RowMapping, Select, func, sele
 
 from service.contract.base import Page
 from service.errors import BadBatch, Fault, shown_value
+from service.observations.schema import LIVE
 from service.storage.archive.reading import Archive, Block, PlacedPart, parts_between
 from service.storage.recording.ids import is_ulid
-from service.storage.recording.unsaved_result import AHEAD_NS, LIVE
+from service.storage.recording.unsaved_result import AHEAD_NS
 from service.storage.sql.tables import batches, results
 from service.times import Utc, recorded_utc
 

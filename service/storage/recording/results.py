@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from sqlalchemy import BigInteger, Connection, and_, bindparam, delete, insert, select, update
 
 from service.errors import AcquisitionError, Busy
+from service.observations.schema import LIVE
 from service.storage.recording import events
 from service.storage.recording.identity import (
     ExistingResult,
@@ -18,7 +19,7 @@ from service.storage.recording.identity import (
     stored_answers,
 )
 from service.storage.recording.result_metrics import split_anew
-from service.storage.recording.unsaved_result import LIVE, Answered, PredictedFrom, UnsavedResult
+from service.storage.recording.unsaved_result import Answered, PredictedFrom, UnsavedResult
 from service.storage.sql import tables
 from service.storage.sql.chain_tables import record_leaves
 from service.storage.sql.columns import Row

@@ -15,7 +15,7 @@ from msgspec import UNSET, Struct, structs
 from service.acquire import Acquisition
 from service.contract.answers import Answer, Attitude, FrameSummary, FrameTimings
 from service.observations.frame_record import FrameRecord
-from service.observations.schema import Submission
+from service.observations.schema import LIVE, Submission
 from service.storage.recording.answer import answer_of, rows_of_stars
 from service.storage.recording.chain import leaf_of
 from service.storage.recording.identity import digest_of_encoded, encoded_rows
@@ -24,8 +24,6 @@ from service.storage.sql.columns import Row
 from service.times import Utc
 from service.trends.measures import MeasuredStars
 
-LIVE = "live"
-"""Name of the run of batches sent by live pipelines."""
 AHEAD_NS = 3600 * 10**9
 """Nanoseconds: a live batch dated further in the future is never shown as the latest."""
 STARS = ("observed", "unique", "ambiguous", "unmatched")

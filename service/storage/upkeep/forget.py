@@ -17,8 +17,8 @@ from sqlalchemy.exc import IntegrityError
 
 from service.contract.runs import Forgotten
 from service.errors import BadConfiguration, NotFound, shown_value
+from service.observations.schema import LIVE
 from service.storage.projections import rollups
-from service.storage.recording.unsaved_result import LIVE
 from service.storage.sql.columns import Row
 from service.storage.sql.definitive_tables import graded_days
 from service.storage.sql.statements import count, rows_of

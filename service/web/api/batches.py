@@ -14,7 +14,7 @@ from service.contract.spacecraft import GyroBlockPage, GyroBlockRow, GyroSamples
 from service.errors import BadBatch, BadInput, Fault
 from service.gyro.blocks import GyroBlockIn
 from service.ingest.submit import MAX_ARRAY, Outcome
-from service.observations.schema import BatchIn, Key, OptionsIn, RunName, Wire
+from service.observations.schema import LIVE, BatchIn, Key, OptionsIn, RunName, Wire
 from service.storage.recording.unsaved_result import Answered
 from service.web.openapi import IDEMPOTENCY_KEY, LINK, LOCATION, REPLAYED, ApiRouter, Returns
 from service.web.requests import query_parameters as params
@@ -206,7 +206,7 @@ class CompareIn(Wire):
     """Request body that selects batches and two sets of options; omitted ones stay as recorded."""
 
     spacecraft: Key
-    run: RunName = "live"
+    run: RunName = LIVE
     start: params.Start = None
     end: params.End = None
     sample: SampleSize = 100

@@ -28,7 +28,7 @@ from service.app.factory import App
 from service.contract.alarms import Alarm
 from service.errors import AcquisitionError, BadInput, Busy, problem_of, problem_of_faults
 from service.feature import feature_folders, feature_modules
-from service.storage.recording.unsaved_result import LIVE
+from service.observations.schema import LIVE
 from service.times import Utc, parse_utc
 from service.trends.limits import Severity
 from service.web.console.formatting import FILTERS, completed_utc, present

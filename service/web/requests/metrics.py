@@ -25,8 +25,8 @@ from service.app.factory import App
 from service.contract.spacecraft import ZoneCache
 from service.feature import feature_modules
 from service.ingest.queue import OUTCOMES, Backlog, RecordedCounts
+from service.observations.schema import LIVE
 from service.storage.progress import Lag
-from service.storage.recording.unsaved_result import LIVE
 from service.storage.upkeep.expiries import Expiries
 from service.times import recorded_utc, unix_seconds
 

@@ -16,11 +16,10 @@ from service.contract.answers import Star as FoundStar
 from service.contract.base import Page
 from service.errors import BadBatch, BadInput, Fault, NotFound, shown_value
 from service.identify.hypotheses.verified import UNIQUE_PROBABILITY
-from service.observations.schema import Key
+from service.observations.schema import LIVE, Key
 from service.storage.queries.results import OutcomeName, StatusName
 from service.storage.queries.star_field import ObservedStarPlace, StarField
 from service.storage.recording.ids import is_ulid
-from service.storage.recording.unsaved_result import LIVE
 from service.times import Utc, recorded_utc
 from service.trends.quantities import QUANTITIES
 from service.vectors import matrix_from_quaternion, to_ra_dec

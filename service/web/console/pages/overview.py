@@ -9,8 +9,8 @@ import numpy as np
 from pydantic import Field
 from starlette.responses import Response
 
+from service.observations.schema import LIVE
 from service.storage.queries.fleet import PERIODS_S, Fleet, FleetCells, FleetRow, Period
-from service.storage.recording.unsaved_result import LIVE
 from service.trends.limits import Severity
 from service.trends.measures import BatchShare, StarShare
 from service.trends.quantities import QUANTITIES, OneOf

@@ -12,8 +12,7 @@ from service.contract.alarms import Annotation, Limit
 from service.contract.answers import Summary
 from service.contract.base import Page
 from service.contract.spacecraft import MissionThen, Ranking
-from service.observations.schema import Key
-from service.storage.recording.unsaved_result import LIVE
+from service.observations.schema import LIVE, Key
 from service.times import (
     DAY_S,
     HOUR_S,
