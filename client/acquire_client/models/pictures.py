@@ -1,4 +1,4 @@
-"""A picture of any camera, solved without a record: its attitude, its lens and its stars."""
+"""Record of a solved picture from any camera, which is not stored: attitude, lens and stars."""
 # Written by `make client` from service/features/pictures/records.py.
 
 from collections.abc import Sequence
