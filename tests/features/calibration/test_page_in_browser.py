@@ -60,7 +60,7 @@ def test_calibrate_try_adopt_and_take_back(browser, folder):
         page = f"{address}/spacecraft/TWO/calibration"
         browser.open(page)
         assert "has no calibration yet" in browser.run("found.innerText")
-        browser.run("signed.elements.who.value = 'J. Operator'")
+        browser.run("calibrate.elements.who.value = 'J. Operator'")
         browser.run("document.querySelector('#calibrate button').click()")
         browser.wait(lambda: "version=1" in browser.run("location.search"), 60)
         # The page is shown while the rest of it is still read.

@@ -1,27 +1,17 @@
 // Calibrates, tries a calibration over recorded batches, adopts it, and takes it back.
 import { attempt, element, ended, rememberWho, send } from "./actions.js";
 import { refreshSoon } from "./live_updates.js";
-import { signed as signedBy } from "./sign.js";
+import { signed } from "./sign.js";
 
 const message = document.getElementById("message");
-const signed = document.getElementById("signed");
 const form = document.getElementById("calibrate");
 const trial = document.getElementById("trial");
 
-if (signed) {
-  rememberWho(signed.elements.who);
-  signed.addEventListener("submit", (event) => event.preventDefault());
-}
-
-function author() {
-  return signed.elements.who.value.trim();
-}
+if (form) rememberWho(form.elements.who);
 
 form?.addEventListener("submit", (event) => {
   event.preventDefault();
-  if (!signed.reportValidity()) return;
-  const { start, end, degree, sample, alignment, scale, magnitudes, time_tag: timeTag } =
-    form.elements;
+  const { who, start, end, degree, sample, alignment, scale, magnitudes, time_tag: timeTag } = form.elements;
   attempt(event.submitter, message, async () => {
     const begun = await send("POST", "/api/v1/calibrations", JSON.stringify({
       spacecraft: form.dataset.spacecraft,
@@ -34,7 +24,7 @@ form?.addEventListener("submit", (event) => {
       scale: scale.checked,
       magnitudes: magnitudes.checked,
       time_tag: timeTag.checked,
-      who: author(),
+      who: who.value.trim(),
     }));
     const found = await ended(`/api/v1/calibrations/${begun.id}`, ({ state }) => !["queued", "running"].includes(state), ({ version, done, total }) => {
       message.textContent = `Version ${version}: ${done} of ${total} batches.`;
@@ -83,7 +73,7 @@ document.addEventListener("click", async (event) => {
   if (!button) return;
   const { adopt, revert, title } = button.dataset;
   const { changes } = document.getElementById("what-changes").dataset;
-  const sign = await signedBy(title, changes.split("|"), adopt === undefined ? "Put back" : "Adopt");
+  const sign = await signed(title, changes.split("|"), adopt === undefined ? "Put back" : "Adopt");
   if (sign === null) return;
   const said = { who: sign.who, note: sign.comment };
   attempt(button, message, async () => {
