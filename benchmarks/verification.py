@@ -119,7 +119,7 @@ def remake(names: Sequence[str], quick: bool, seed: int, output: Path) -> bool:
                 (plots / file).write_text(picture, encoding="utf-8")
         for file, beside in written.pages.items():
             (output.parent / file).write_text(beside, encoding="utf-8")
-        # After each, so that a long run that is stopped has kept what it made.
+        # Write after each section, so that an interrupted run keeps its results.
         output.write_text(page(sections), encoding="utf-8")
     return not out_of_bounds(sections)
 

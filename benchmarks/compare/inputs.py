@@ -149,7 +149,7 @@ class _Draw:
             mission = MISSIONS[k % len(MISSIONS)]
             identifier = IDENTIFIERS[k // len(MISSIONS) % len(IDENTIFIERS)]
             prior = PRIORS[k // (len(MISSIONS) * len(IDENTIFIERS)) % len(PRIORS)]
-            # A direction does not tell where a tracker looks that is not along the zone's axis.
+            # For a tracker off the zone's axis a direction alone does not determine its boresight.
             drawn_as: PriorKind = (
                 "direction" if prior == "direction" and mission != TWIN else "quaternion"
             )

@@ -63,7 +63,7 @@ def _text(quick: bool, figures: dict[str, Any]) -> Iterator[Bound]:
     ways: dict[str, Callable[[], object]] = {"brahe": lambda: message.to_string("KVN")}
     ways |= {name: lambda name=name: written(name) for name in TEXTS}  # type: ignore[misc]
     best = dict.fromkeys(ways, np.inf)
-    # In turns, so that all meet the same load.
+    # In rotation, so that all meet an equal load.
     for _ in range(QUICK_ROUNDS if quick else ROUNDS):
         for name, way in ways.items():
             best[name] = min(best[name], _seconds(way))
@@ -78,7 +78,7 @@ def _parquet(quick: bool, seed: int, figures: dict[str, Any]) -> Iterator[Bound]
     count = QUICK_BATCHES if quick else BATCHES
     with tempfile.TemporaryDirectory() as folder:
         database, file = Path(folder) / "filled.db", Path(folder) / "batches.parquet"
-        # Half of them are of the spacecraft and run that is exported.
+        # Half of the batches belong to the exported spacecraft and run.
         fill(database, 2 * count, seed, 0)
         command = [sys.executable, "-m", "benchmarks.speed.command_memory", "export", "batches"]
         command += ["--spacecraft", "XTE", "--format", "parquet", "--output", str(file)]

@@ -91,7 +91,7 @@ def _measured(filtering: Served, plain: Served, drawn: Sequence[DrawnBatch], cou
     length = count + ONE_BY_ONE
     for number, first in enumerate(range(WARM, len(drawn), length)):
         part = drawn[first : first + length]
-        # The first of two may find the machine otherwise than the second.
+        # Alternate the order, since load may differ between first and second.
         for name in sorted(servers, reverse=number % 2 == 1):
             many = _post(servers[name], part[:count], name, CONNECTIONS)
             spent_s[name].append(many.seconds)
@@ -108,7 +108,7 @@ def _measured(filtering: Served, plain: Served, drawn: Sequence[DrawnBatch], cou
     sigmas = np.sqrt(np.diag(latest["covariance_arcsec2"]))
     worst = float(np.abs(errors / sigmas).max())
     turns = [a / b for a, b in zip(spent_s["with"], spent_s["without"], strict=True)]
-    # Of all turns together: the filter looks in some of them, not in each.
+    # Over all turns together, since the filter runs in some of them only.
     ratio = sum(spent_s["with"]) / sum(spent_s["without"])
     cpu_ratio = cpu_s["with"] / cpu_s["without"]
     waits = [a / b for a, b in zip(p50_ms["with"], p50_ms["without"], strict=True)]

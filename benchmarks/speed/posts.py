@@ -341,7 +341,7 @@ def bulk(quick: bool, pass_: Telemetry, folder: Path) -> tuple[dict[str, Any], l
         place = _start_replay(served, lines, "beside")
         beside = waits_beside(served, pass_, lambda: _finished(served, place))
         memory_mb = served.resident_mb()
-    # Before and after: the machine may be faster at one time than at another.
+    # Measure before and after, since the machine's speed varies.
     ceilings.append(_parse_and_insert(alone, folder / "after.db"))
     ceiling = median(ceilings)
     figures = {
@@ -363,7 +363,7 @@ def bulk(quick: bool, pass_: Telemetry, folder: Path) -> tuple[dict[str, Any], l
         figures["beside bulk: p99 of single posts, ms"] = beside.percentile_ms(99)
         figures["beside bulk: p99 over idle"] = wait
         bounds.append(at_most("p99 of single posts beside bulk over idle", wait, MOST_WAIT))
-    # Without a hundred of them there is no p99.
+    # A p99 needs a hundred posts.
     bounds.append(at_least("single posts while bulk ran", len(beside.waits_ms), 100))
     return figures, bounds
 
@@ -385,7 +385,7 @@ def waits_beside(served: Served, pass_: Telemetry, work: Callable[[], object]) -
     over = threading.Event()
 
     def post() -> None:
-        # Only what was posted while the work went on counts.
+        # Only posts during the work count.
         part = 0
         while not over.is_set():
             part += 1

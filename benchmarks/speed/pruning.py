@@ -44,7 +44,7 @@ TRENDS = (
     "tracker_rollups_daily",
 )
 COPIED = (*LARGEST, "tracker_values", *TRENDS)
-# Of a copy the first letter of its ids, which is 0 in this millennium.
+# First letter of a copy's ids, by day; recorded ids begin with 0 in this millennium.
 _LETTERS = "0123456789ABCDEFGHJKMNPQRSTVWXYZ"
 _KEYS = ("id", "batch_id", "result_id")
 # Sessions that still see rows as they were before a transaction.

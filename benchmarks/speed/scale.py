@@ -109,7 +109,7 @@ def filled(url: str, count: int, seed: int, period_s: float = PERIODS_S[OFTEN]) 
     app = _opened(url)
     spent_s = 0.0
     try:
-        # Zones and connections are there before the clock runs.
+        # Build zones and open connections before the clock runs.
         _record(app, list(islice(made, CHUNK)), "first")
         before = _size(url)
         for _ in tqdm(range(0, count, CHUNK), desc=name, unit_scale=CHUNK, unit=" batches"):
@@ -311,7 +311,7 @@ def emptied(url: str) -> None:
 
 def size_text(size: float) -> str:
     for unit, name in ((1e9, "GB"), (1e12, "TB")):
-        # From 999.5 on three digits would be shown as 1e+03.
+        # From 999.5 on, three digits would be written as 1e+03.
         if size < 999.5 * unit:
             return f"{size / unit:.3g} {name}"
     return f"{size / 1e15:.3g} PB"

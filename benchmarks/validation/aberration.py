@@ -45,7 +45,7 @@ def run(quick: bool, seed: int) -> Report:
         priors = batches.prior_attitudes(rng, passes.toml, 20)
         off, shift, noise = [], [], []
         for number in range(count):
-            # Each of its own: where one way sees a star more at an edge, more would be drawn.
+            # A generator per batch, since the ways may draw different numbers of stars at an edge.
             rng = np.random.default_rng([seed, number])
             prior = priors[rng.integers(len(priors))]
             directions = passes.seen if apparent else passes.directions

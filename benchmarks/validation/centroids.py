@@ -177,7 +177,7 @@ def _row(
         slack = max(0.10, doubt)
         bounds.append((AS_TOLD, between(method, normal, 1.0 - slack, 1.0 + slack)))
         if method == "matched":
-            # Its twin `recursive` ends at the same place.
+            # `recursive` ends at the same position.
             cells.append(f"{bias:.4f}")
         if method in FITTED:
             slack = max(0.15, doubt)

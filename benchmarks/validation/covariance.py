@@ -141,7 +141,7 @@ def run(quick: bool, seed: int) -> Report:
                     if solution is None:
                         continue
                     suspect += solution.suspect
-                    # Of all attitudes: without the suspect ones TASTE is no chi-square.
+                    # Use all attitudes: without the suspect ones TASTE does not follow chi-square.
                     tastes.append(solution.taste)
                     freedoms.append(solution.degrees_of_freedom)
                     error = error_of(truth, found)

@@ -121,7 +121,7 @@ def _measured(drawn: DrawnFrame, mission: Mission, compared: bool) -> CrossedFra
         errors[method] = (placed[:, :2] / placed[:, 2:]).ravel().tolist()
     found = CrossedFrame(whole, errors)
     if compared:
-        # Of every candidate: that camera has no reason to doubt any.
+        # Use all candidates: a camera without wires has no reason to reject any.
         (missed, placed), *_ = _placed(drawn, mission_with("gaussian"), ("scan",)).values()
         found.naive_missed = missed
         found.naive_stars = whole.stars - whole.hidden

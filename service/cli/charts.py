@@ -81,7 +81,7 @@ def _richest(report: "MissionReport", zone: ZoneCensus) -> list[str]:
             np.outer(np.cos(turn), first) + np.outer(np.sin(turn), second)
         )
         places = _projected(*to_ra_dec(ring))
-        # The outline is cut where it leaves the map on one side and comes in on the other.
+        # Cut the outline where it leaves the map on one side and re-enters on the other.
         breaks = np.flatnonzero(np.abs(np.diff(places[:, 0])) > PICTURE_WIDTH / 4) + 1
         parts += [
             f'<polyline points="{_star_points(piece)}" fill="none" stroke="#fff" stroke-width="2"/>'
@@ -96,7 +96,7 @@ def _richest(report: "MissionReport", zone: ZoneCensus) -> list[str]:
 
 def _projected(ra_deg: Vector, dec_deg: Vector) -> Vector:
     """Points (n, 2) on Hammer's equal-area map of the sky, centred on right ascension 180 deg."""
-    # A hair inside the edge: 0 and 360 deg are its two sides.
+    # Stay slightly inside the edge: 0 and 360 deg are its two sides.
     longitude = np.radians(np.clip(180.0 - ra_deg % 360.01, -179.99, 179.99)) / 2.0
     latitude = np.radians(dec_deg)
     root = np.sqrt(1.0 + np.cos(latitude) * np.cos(longitude))

@@ -102,7 +102,7 @@ class _Reader(ccsds.MessageReader):
         predicted = [each for each in segments if each.basis == "PREDICTED"]
         others = [each for each in segments if each.basis != "PREDICTED"]
         if predicted and others:
-            # A time of both is that of what was not predicted.
+            # At a time in both parts, the attitude that was not predicted has precedence.
             parts = (in_order(source.name, predicted), in_order(source.name, others))
             segments = by_priority([*parts[0], *parts[1]])
         return known_attitudes(source.name, self._object_name, segments)

@@ -157,7 +157,7 @@ class _Reader(ccsds.MessageReader):
         self._check_object(metadata)
         sequence = self._sequence(metadata, type)
         if type.rates == "euler" and not sequence:
-            # Without a sequence the rates of version 1 can be but an angular velocity.
+            # Without a sequence the rates of version 1 can only be an angular velocity.
             type = AttitudeType(type.attitude, "angvel")
         from_body = ccsds.from_body(metadata)
         reverse = self._v1_keyword(metadata, "ATTITUDE_DIR") == "B2A"

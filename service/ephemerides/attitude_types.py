@@ -102,7 +102,7 @@ def body_attitudes(
         rate = np.radians(more) * (-1.0 if frames.from_body else 1.0)
         return body, rate if frames.rate_in_body else _components(body, rate)
     rate = _rates(type, q, more, given, frames.sequence)
-    # Of A relative to B it is the opposite of that of B relative to A, about the axes of A.
+    # The rate of A relative to B, about A's axes, is minus the rate of B relative to A.
     return body, -_components(body, rate) if frames.is_inverse else rate
 
 
@@ -134,7 +134,7 @@ def _of_spin(given: Vector, sequence: str) -> Vector:
 def _of_matrix(given: Vector, sequence: str) -> Vector:
     from scipy.spatial.transform import Rotation
 
-    # scipy turns vectors, a matrix of a message the axes.
+    # scipy's matrices rotate vectors, those of a message rotate the axes.
     matrices = given.reshape(-1, 3, 3).transpose(0, 2, 1)
     return np.asarray(Rotation.from_matrix(matrices).as_quat())
 

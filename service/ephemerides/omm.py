@@ -153,7 +153,7 @@ def _set(source: ccsds.Source, line: int, fields: Mapping[str, str]) -> ElementS
     from sgp4.api import SGP4_ERRORS, WGS72, Satrec
 
     for name, known in _FIXED.items():
-        # A catalog leaves cells empty, too.
+        # A catalog may have empty cells.
         value = fields.get(name) or known[0]
         if value.upper() not in known:
             raise source.bad(line, name, f"must be {' or '.join(known)}", value)
@@ -170,7 +170,7 @@ def _set(source: ccsds.Source, line: int, fields: Mapping[str, str]) -> ElementS
     elements.sgp4init(
         WGS72,
         "i",
-        # The number of the object moves nothing, and SGP4 knows none beyond 339,999.
+        # The object's number has no effect on the motion, and SGP4 accepts none beyond 339,999.
         0,
         utc.jd1 - _JD_OF_1950 + utc.jd2,
         number["BSTAR"],

@@ -37,7 +37,7 @@ _FIELDS: dict[int, tuple[tuple[str, int, int, str], ...]] = {
         ("derivative of the mean motion", 33, 43, r"[ +-]\.\d{8}"),
         ("second derivative of the mean motion", 44, 52, _EXPONENT),
         ("drag term", 53, 61, _EXPONENT),
-        # 4 is SGP4-XP, which is another model.
+        # Type 4 is SGP4-XP, another model.
         ("ephemeris type", 62, 63, "[ 02]"),
         ("element set number", 64, 68, r" *\d*"),
     ),
@@ -112,7 +112,7 @@ def read_tle(name: str, file: IO[bytes], field: str) -> TleEphemeris:
         if first is None and not text.startswith("1 "):
             if text.startswith("2 "):
                 raise source.bad(line, "line 2", "must follow line 1 of its set", text)
-            # After the first set it is another set's, or a bulletin's last line.
+            # After the first set, the line belongs to another set, or ends a bulletin.
             title = title if sets else text.removeprefix("0 ").strip()
             continue
         _check(source, line, text, 1 if first is None else 2)

@@ -214,7 +214,7 @@ class _XmlReader:
     def _start(self, tag: str, attributes: dict[str, str]) -> None:
         tag = tag.rpartition(":")[2]
         if not self._path and tag.lower() == "ndm":
-            # Several messages in one, such as catalogs are sent in.
+            # A combined message with several messages, the form of many catalogs.
             self._path.append("ndm")
             return
         if self._path in ([], ["ndm"]):

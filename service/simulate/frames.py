@@ -208,7 +208,7 @@ def _stars(
     beyond_deg = max(0.5, math.degrees(1.5 * margin / camera.focal_length_px))
     near = math.cos(math.radians(min(camera.corner_radius_deg + beyond_deg, 89.0)))
     row = np.flatnonzero(run.direction @ boresight >= near)
-    # The light of these is that of another row already.
+    # The light of these stars is already part of another row.
     row = row[~everything.catalog.light_elsewhere[run.catalog_row[row]]]
     direction = everything.directions(row, time, position_km)
     direction = apparent(direction, observer_velocity(time, velocity_km_per_s), time)

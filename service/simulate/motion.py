@@ -40,7 +40,7 @@ def body_rates_deg_per_s(mission: Mission, batches: int, rng: np.random.Generato
         axis = mission.axis_body if rolls else random_axis(rng)
         rates[at : at + turning] = share * axis * SLEW_DEG_PER_S
         at += turning + int(rng.integers(*held))
-    # What is written is what was flown.
+    # Round the rates of the motion, since the written rates are rounded.
     return np.round(rates, 7)
 
 
@@ -50,7 +50,7 @@ def slewing_attitudes(rates_deg_per_s: Vector, cadence_s: float, first: Matrix) 
     for rates in rates_deg_per_s:
         yield attitude
         attitude = turned_by(attitude, np.radians(rates) * cadence_s)
-        # A product of many rotations drifts from being one.
+        # Restore orthogonality, which a product of many rotations loses.
         u, _, vt = np.linalg.svd(attitude)
         attitude = u @ vt
 
@@ -68,7 +68,7 @@ def pointed(axis_body: Vector, direction: Vector, roll_rad: float) -> Matrix:
 
 def across(direction: Vector) -> tuple[Vector, Vector]:
     """Two directions perpendicular to each unit vector (..., 3) and to each other."""
-    # The coordinate axis that it leans to least is never along it.
+    # The coordinate axis farthest from the direction is never parallel to it.
     aside = unit(np.cross(direction, np.eye(3)[np.argmin(np.abs(direction), axis=-1)]))
     return aside, np.cross(direction, aside)
 

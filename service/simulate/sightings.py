@@ -165,7 +165,7 @@ class BatchScene:
     def _visible(self, tracker: Tracker, attitude: Matrix, most: int) -> Seen:
         alignment = tracker.body_from_tracker
         radius = math.radians(tracker.field_of_view_radius_deg)
-        # Somewhat wider: its own motion, aberration and the body's turning may bring a star in.
+        # Use a wider radius: proper motion, aberration or rotation of the body may bring a star in.
         near = math.cos(min(radius + math.radians(0.2), math.pi))
         row = np.flatnonzero(self.sky.run.direction @ (attitude.T @ alignment[:, 2]) >= near)
         direction = self.sky.directions(row, self.time, self.position_km)

@@ -97,7 +97,7 @@ def create_app(app: App, limits: BodyLimits = DEFAULT_LIMITS) -> FastAPI:
             notify_supervisor("STOPPING=1")
             await web_app.state.live.close()
             app.service.cancel_warmup()
-            # The handlers' own threads may all be at work still.
+            # All threads of the handlers may still be busy.
             own = anyio.CapacityLimiter(1)
             await anyio.to_thread.run_sync(warming.join, limiter=own)
             await anyio.to_thread.run_sync(app.close, limiter=own)
@@ -170,7 +170,7 @@ def _warm_up(web_app: FastAPI, app: App, loop: asyncio.AbstractEventLoop) -> Non
         app.service.ready()
         asyncio.run_coroutine_threadsafe(warm_request(web_app), loop).result()
     except Exception as error:
-        # /readyz reports it, and its next call tries again.
+        # /readyz reports the error, and the next call of it tries again.
         log.warning("not ready yet: %s", error)
 
 
@@ -189,7 +189,7 @@ async def report_to_supervisor(app: App) -> None:
     """
     if "NOTIFY_SOCKET" not in os.environ:
         return
-    # The handlers' own threads may all be at work.
+    # All threads of the handlers may be busy.
     own = anyio.CapacityLimiter(1)
     while not await anyio.to_thread.run_sync(_is_ready, app, limiter=own):
         await asyncio.sleep(TRY_AGAIN_S)
@@ -244,6 +244,6 @@ _Dumper.add_representer(str, _text)
 
 def openapi_yaml() -> str:
     """Text of `openapi.yaml`, made without a running service."""
-    # Once through JSON: YAML would mark what is shared between places.
+    # Convert by JSON, since YAML would mark objects that are shared between places.
     plain = json.loads(json.dumps(bare_app().openapi()))
     return str(yaml.dump(plain, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100))

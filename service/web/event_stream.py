@@ -112,7 +112,7 @@ class Live:
         else:
             try:
                 last = await self._read(self._app.events.last)
-                # How many events there are of others is no business of a bound token.
+                # A bound token must not learn the number of events of other spacecraft.
                 newest = await self._read(self._app.events.last, listener.caller.spacecraft)
             except BaseException:
                 self.leave(listener)
@@ -151,7 +151,7 @@ class Live:
                     yield lines
                 continue
             if clock() - heard_s >= HEARTBEAT_S:
-                # A number alone: the listener comes again from here, and hears of nothing.
+                # Send the number alone: the listener reconnects from it, and receives no event.
                 heard_s = clock()
                 yield f": {HEARTBEAT_S:g} s without news\nid: {last}\n\n".encode()
             wait_s = min(heard_s + HEARTBEAT_S, end_s) - clock()
@@ -180,7 +180,7 @@ class Live:
             try:
                 await self._take()
             except Exception as error:
-                # The records are out of reach for a while: nothing is lost, it comes later.
+                # The database is unavailable for a while: nothing is lost, events are sent later.
                 log.warning("events could not be read: %s", error)
 
     async def _end_what_is_revoked(self) -> None:
@@ -199,7 +199,7 @@ class Live:
                             each.is_admitted = False
                     self._tell()
                 except Exception as error:
-                    # Nothing is known of anybody while the records are out of reach.
+                    # While the database is unavailable, no listener can be checked.
                     log.warning("listeners could not be looked up: %s", error)
                     break
 

@@ -171,7 +171,7 @@ class AroundRequests:
     async def _audit(self, scope: Scope, status: int) -> None:
         state = scope["state"]
         action = state["changes"]
-        # A change carries its own entry.  A 503 decides nothing, and its cause may be the database.
+        # A change stores its own entry.  A 503 decides nothing, and the database may be its cause.
         if status == 503 or (state.get("noted") and status < 400):
             return
         try:
@@ -377,7 +377,7 @@ def _tagged(start: Message, message: Message, asked: Headers) -> tuple[Message, 
     digest = blake2b(message.get("body", b""), digest_size=DIGEST_BYTES).hexdigest()
     headers = MutableHeaders(raw=list(start["headers"]))
     headers["ETag"] = tag = f'W/"{digest}"'
-    # It may be the caller's alone, and is asked for again each time: a session may have ended.
+    # The answer may be for one caller, and must be checked each time: a session may have ended.
     headers.setdefault("Cache-Control", "private, no-cache")
     if not _names(asked, tag):
         return {**start, "headers": headers.raw}, message

@@ -47,7 +47,7 @@ def serve(settings: Settings) -> None:
     Raises `BadConfiguration` for settings that cannot be used, and for a host other than
     a loopback address while there are no tokens: every client could submit there.
     """
-    # A mistake is named before the database is opened.
+    # Report a mistake in the settings before the database is opened.
     for module in feature_modules("serving", settings.features_off):
         module.check(settings)
     app, probes = _opened(settings)
@@ -82,7 +82,7 @@ def configuration(settings: Settings, web_app: ASGIApp) -> uvicorn.Config:
         http=cast(type[asyncio.Protocol], Connection),
         loop="uvloop",
         ws="none",
-        # As `service.logs` has it; requests are logged where their caller is known.
+        # Logging is configured by `service.logs`; requests are logged where their caller is known.
         log_config=None,
         access_log=False,
         server_header=False,

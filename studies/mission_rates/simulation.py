@@ -127,7 +127,7 @@ def _values(text: str) -> list[float]:
         first, last, step = map(float, text.split(":"))
         if not (step > 0.0 and math.isfinite(first) and math.isfinite(last)):
             raise ValueError
-        # A hair more, so that rounding does not lose the last value.
+        # A small addition, so that rounding does not lose the last value.
         count = int((last - first) / step + 1e-9) + 1 if last >= first else 0
         values = [
             float(f"{first + k * step:.{MOST_DIGITS}g}")

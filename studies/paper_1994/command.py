@@ -118,7 +118,7 @@ def measured(wanted: Sequence[int], seed: int, identifier: Identifier) -> list[R
     for number, shares in zip(TIMES, PROPORTIONS, strict=True):
         if not {number, shares} & set(wanted):
             continue
-        # Tables 13 and 14 are of the zones of 11 and 12, measured once for both.
+        # Tables 13 and 14 use the zones of 11 and 12, measured once for both.
         cases = [each for each in the_paper().times if each.table == str(number)]
         zones = [(case, measure(case, seed, identifier)) for case in cases]
         if number in wanted:

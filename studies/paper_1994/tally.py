@@ -100,7 +100,7 @@ def spread(tally: Tally) -> Spread:
     counts = unidentified_and_wrong(tally.counts).astype(np.float64)
     zones = len(counts)
     kind = np.arange(zones) % world.strata
-    # What differs from date to date of the Sun is the same in every experiment.
+    # The variation with the Sun's date is equal in all experiments, and so no part of the scatter.
     means = np.stack([counts[kind == k].mean(axis=0) for k in range(world.strata)])
     apart = counts - means[kind]
     covariance = apart.T @ apart / (zones - world.strata)

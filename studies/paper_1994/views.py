@@ -118,7 +118,7 @@ def _view(
 ) -> View:
     tracker = mission.trackers[0]
     near = _within(axis, math.radians(world.off_axis_deg), rng)
-    # Body X lies near the zone's axis; the rest of the attitude is any.
+    # Body X lies near the zone's axis; the rest of the attitude is random.
     attitude = pointed(mission.axis_body, near, rng.uniform(0.0, math.tau))
     boresight = attitude.T @ tracker.body_from_tracker[:, 2]
     edge = math.cos(math.radians(tracker.field_of_view_radius_deg))

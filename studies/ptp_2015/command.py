@@ -231,7 +231,7 @@ def _not_of_table_5(databases: Sequence[comparison.Database]) -> list[comparison
 
 def _in_short(found: Measurements) -> list[str]:
     """Summary table of the algorithms at one and at two pixels, the best strict rate first."""
-    # Of one pixel and half a magnitude: it is their order that is claimed.
+    # At one pixel and half a magnitude; the claim is about the order of the rates.
     printed = {row.algorithm: row.rate_pct for row in the_ptp_paper().table_6}
     rows = []
     for px in (1.0, 2.0):

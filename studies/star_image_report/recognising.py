@@ -143,7 +143,7 @@ def _discrimination(study: Study) -> dict[int, list[tuple[int, float, float]]]:
         keys = [chord_constant(field) for field in fields]
         shares[stars] = []
         for size in sizes:
-            # Several small stores, so that one unlucky field does not speak for all.
+            # Average over several small stores, so that one unusual field does not decide.
             unique = nearest = draws = 0
             for first in range(0, max(size, LEAST_FIELDS // size * size), size):
                 store = store_of({str(k): (stars, keys[k]) for k in range(first, first + size)})

@@ -74,7 +74,7 @@ def bounds_of(rows: Sequence[Row]) -> list[Bound]:
         allowed = math.ceil(MOST_WRONG.get(row.condition, 1e-4) * row.scenes)
         bounds.append(at_most(f"{where}: wrong of {row.scenes:,}", row.wrong, allowed))
         for other in rows:
-            # The same scenes.
+            # Compare only rows with the same scenes.
             if (row.condition, other.condition) in FEWER and row.scenes == other.scenes:
                 label = f"{where}: right, beside {other.right:,} of {other.condition}"
                 bounds.append(at_least(label, row.right, other.right))

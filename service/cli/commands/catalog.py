@@ -96,7 +96,7 @@ def import_catalog(parsed: Namespace) -> int:
     from service.sky.catalog.csv_file import FIRST_EPOCH, LAST_EPOCH
     from service.sky.catalog.star_catalog import catalog_format, import_csv, import_sky2000, save
 
-    # Of night.dat.gz the name is night.
+    # The name of night.dat.gz is night.
     name = parsed.file.name.removesuffix(".gz").rpartition(".")[0] or parsed.file.name
     output = parsed.output or parsed.file.with_name(f"{name}.npz")
     left_out: tuple[str, ...] = ()

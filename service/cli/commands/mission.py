@@ -132,7 +132,7 @@ def check(parsed: Namespace) -> int:
     begun = time.process_time()
     if parsed.file.suffix != ".toml" and not parsed.file.exists():
         parsed.file = arguments.mission_and_file(str(parsed.file))[1]
-    # A file that is not there is no mission file at all.
+    # Raise for a missing file, which is no faulty mission file.
     parsed.file.open("rb").close()
     try:
         mission = read_mission(parsed.file)
@@ -223,7 +223,7 @@ def estimate(parsed: Namespace) -> int:
     mission = arguments.mission_of_file_or_name(parsed.mission)
     epoch_year = mission.catalog.epoch_of(epoch_of(parsed.epoch))
     size_key = "half_width_deg" if mission.zone.kind == "band" else "radius_deg"
-    # Everything is checked before anything is counted.
+    # Check all arguments before the first count.
     limited = [
         _changed(mission, "catalog", "magnitude_limit_mag", each, "--magnitude-limit")
         for each in parsed.magnitude_limit or [mission.catalog.magnitude_limit_mag]

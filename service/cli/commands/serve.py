@@ -40,7 +40,7 @@ def run(parsed: Namespace) -> int:
     gc.disable()
     settings = settings_of(parsed)
     if not faulthandler.is_enabled():
-        # A fault in compiled code ends the process; this says where.
+        # A fault in compiled code ends the process; the handler prints where.
         faulthandler.enable()
     from service import logs
     from service.settings import require_free

@@ -367,7 +367,7 @@ def _pass_of(parsed: Namespace, mission: "Mission") -> "Pass":
         usual: Trouble = getattr(Troubles(), kind)
         size, share = getattr(parsed, size_name), getattr(parsed, f"{kind}_share")
         if share is None:
-            # A size alone asks for the stretch, too.
+            # A size alone also requests the trouble.
             asked = parsed.serious or size is not None
             share = 0.0 if parsed.nominal else max(usual.share, _SERIOUS_SHARE * asked)
         troubles[kind] = Trouble(share, usual.size if size is None else size)

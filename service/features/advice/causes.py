@@ -161,8 +161,8 @@ def star_table(sample: PeriodSample, sky: SkyModel) -> StarTable:
             ]
     angles = [row["a_priori_angle_deg"] for row in sample.rows]
     kinds = (np.int64, np.int64, "U1", *[np.float64] * 4)
-    # The first, empty part gives each column its type where the sample has no star; numpy's own
-    # annotations know no sequence of kinds.
+    # The empty first part gives each column its type if the sample has no star; numpy's own
+    # annotations cannot express a sequence of kinds.
     batch_of, tracker_of, outcome, magnitude, off_axis, offset_sigmas, offset_mag = (
         np.concatenate([np.empty(0, kind), *parts])  # type: ignore[call-overload]
         for kind, parts in zip(kinds, columns, strict=True)
@@ -309,7 +309,7 @@ def _a_priori(now: StarTable, before: StarTable | None) -> Iterator[Factor]:
             text = "The a priori attitude is worse than before."
             remedy = "Correct its source; until then send the batches as lost in space."
         elif beyond.mean() <= NOISY * np.mean(before.a_priori_deg > before.room_deg) + USUAL_SHARE:
-            # Wrong attitudes are far from the a priori ones, too.
+            # No statement: wrong attitudes are far from correct a priori ones, too.
             return
     stars = beyond[now.batch]
     yield Factor(beyond, stars, text, f"{evidence}.", remedy)

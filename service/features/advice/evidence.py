@@ -177,7 +177,7 @@ def _pairs(
     crossing = angle_between_deg(
         unit(np.cross(observed[i], observed[j])), unit(np.cross(catalog[i], catalog[j]))
     )
-    # Where both differences tell the order, the votes order by the pole and ask no further.
+    # If both differences determine the order, votes compare only the angles to the pole.
     crossing[np.minimum(*apart) > tolerances.pole_difference_deg] = np.nan
     if isinstance(acquisition.batch.a_priori, BoresightPrior):
         crossing[:] = np.nan

@@ -175,7 +175,7 @@ def _axis_rows(
         if k < settling:
             yield None
         else:
-            # Weighed by what each tells: a small gain has a long memory, which adds noise.
+            # Weight by information: a small gain has a long memory, which adds noise.
             weight = gain / s[k]
             yield (
                 (a + r[k]) / s[k],

@@ -189,7 +189,7 @@ class AdviceService:
                 met = latest_innovations(connection, selected, of_gyro=True)
             began = time.monotonic()
             pace = WorkLimit(lambda share: time.monotonic() - began < share * limit_s, step)
-            # Without the search of the whole sky, which would hide faults of the settings.
+            # No search of the whole sky, which would hide faults of the settings.
             run_again = partial(self._submissions.run_again, mission=mission.within_zones)
             run_freely = partial(self._submissions.run_again, mission=mission)
             findings = advise(

@@ -193,7 +193,7 @@ def _verdict(now: float, needed: Interval, beyond: Interval, differences: int) -
         return "no_verdict"
     if now > WIDE * needed.high:
         return "too_wide"
-    # Neither certain: fits where the value needed is at least known to a factor of two.
+    # Neither is certain: "fits" if the needed value is known at least to a factor of two.
     return "fits" if beyond.high <= 1.0 - KEPT or needed.high <= 2.0 * needed.low else "no_verdict"
 
 

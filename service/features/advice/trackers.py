@@ -114,7 +114,7 @@ def _noise(tracker: Tracker, index: int, evidence: Evidence) -> NoiseFinding:
     others = np.arange(len(squared))
     if worst is not None and worst.start >= LEAST_BATCHES:
         if worst.stop <= len(squared) - LEAST_BATCHES // 2:
-            # The disturbance is over; left in the median it would bias the other periods.
+            # The disturbance is over; its value in the median would bias the other periods.
             others = np.delete(others, worst)
         else:
             worst = None

@@ -186,7 +186,7 @@ def _grouped(lines: list[AlarmLine], grouping: Grouping) -> list[AlarmGroup]:
     """Group sorted alarms; groups are in the order of their first alarms."""
     groups: dict[Any, list[AlarmLine]] = {}
     if grouping == "time":
-        # Each group is what left its limits within `TOGETHER_S` after its first.
+        # A group has all alarms raised within `TOGETHER_S` of its first one.
         begun_ns: float = -math.inf
         for line in sorted(lines, key=lambda each: each.last_ns):
             if line.last_ns - begun_ns > TOGETHER_S * 1e9:
@@ -219,7 +219,7 @@ def alarm_page(id: str, query: FromQuery[AlarmQuery], context: ContextDep) -> Re
     """Console page for one alarm: its raise, its usual cause, and the actions of operators."""
     alarm = context.app.part(Alarms).get(id)
     if not context.caller.may_see(alarm.spacecraft):
-        # As if it did not exist: probing for ids of others must tell nothing.
+        # Same answer as for an unknown id: probing must not reveal alarms of other spacecraft.
         raise NotFound(f"there is no alarm with the id {shown_value(id)}")
     raised = recorded_utc(alarm.raised.time)
     around = {"start": shifted(raised, -BEFORE_S).text, "end": shifted(raised, AFTER_S).text}
@@ -250,7 +250,7 @@ def _has_tracker(context: PageContext, alarm: Alarm) -> bool:
 def _end(alarm: Alarm) -> Utc:
     """End of the period shown for an alarm: after its raise and its latest batch."""
     after = shifted(recorded_utc(alarm.raised.time), AFTER_S)
-    # The latest batch belongs to the period, the end of which does not.
+    # The end of the period is excluded, so it lies after the latest batch.
     latest = second_after(alarm.latest.time)
     return max(after, latest, key=lambda moment: moment.tai_ns)
 

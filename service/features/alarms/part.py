@@ -252,7 +252,7 @@ class Limits:
             time_ns: list[int] = []
             samples: list[Sample] = []
             if last is not None:
-                # The latest batch belongs to the period.
+                # The end of the period is excluded, so it lies after the latest batch.
                 start, end = shifted(last, -DAY_S * days), shifted(last, 0.001)
                 period = ResultFilter(run or LIVE, name, start, end)
                 if quantity == REJECTED:

@@ -29,7 +29,7 @@ from service.times import Utc, recorded_utc, utc_now
 from service.trends.limits import LimitSettings, Sample, Severity
 from service.trends.quantities import SILENCE, Subject, quantity_and_tracker, sampler, subject_of
 
-# Run with every batch of a live spacecraft, or with a few of them.
+# This query runs with every batch of a live spacecraft, or with a few of them.
 _PLACE = (watches.c.spacecraft == bindparam("of_spacecraft"), watches.c.run == bindparam("of_run"))
 _LOCK = prepared(select(watches).where(*_PLACE).with_for_update())
 _COLUMNS = ("time", "time_ns", "batch_id", "received", "state")
@@ -101,7 +101,7 @@ class LimitEvaluator:
             gap_ns = batch["time_ns"] - latest_ns
             if gap_ns >= 0:
                 newest, latest_ns = batch, batch["time_ns"]
-            # In another run an older batch that comes late ends no silence.
+            # Outside the live run a late, older batch ends no silence.
             if self._run == LIVE or gap_ns >= 0:
                 since_ns = each.received_ns - received_ns if self._run == LIVE else gap_ns
                 latest = _reference(newest) if newest else (row["time"], row["batch_id"])
@@ -223,8 +223,8 @@ class LimitEvaluator:
         _LAST_SAVED[self._spacecraft, self._run] = state, self._windows
 
 
-# The windows of a spacecraft and run as this process last wrote them, with the text that it wrote:
-# where the database still holds that, it is not decoded again.
+# Windows of a spacecraft and run with their text as last written by this process: if the database
+# still has this text, it is not decoded again.
 _LAST_SAVED: dict[tuple[str, str], tuple[str, dict[str, SampleWindow]]] = {}
 _MAX_SAVED = 64
 
@@ -339,7 +339,7 @@ def _seconds(received: str, now: Utc) -> float:
 
 _IDS = Ulids()
 
-# Run with every batch of a live spacecraft.
+# This query runs with every batch of a live spacecraft.
 _ACTIVE = prepared(
     select(alarms)
     .where(
@@ -406,12 +406,12 @@ class ActiveAlarms:
             return
         changes, actions = state_machine.observed(alarm, severity, limits, point, now, worst)
         if actions:
-            # The changes that were not written yet go with it.
+            # Pending changes of the alarm are written together with it.
             values = {name: alarm[name] for name in _VALUES}
             alarm = change(self._connection, alarm, values | changes, actions, now)
             self._unsaved.discard(subject)
         else:
-            # Values alone are written once, by `save`.
+            # Changed values without a change of state are written once, by `save`.
             alarm = alarm | changes
             self._unsaved.add(subject)
         self._alarms[subject] = alarm

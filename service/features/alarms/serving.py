@@ -30,12 +30,12 @@ async def serving(app: App, metrics: Metrics) -> AsyncIterator[None]:
         yield
     finally:
         task.cancel()
-        # A thread that still reads must not find the database closed.
+        # Wait for the thread: a read in progress must not find the database closed.
         await asyncio.gather(task, return_exceptions=True)
 
 
 async def _evaluate(app: App) -> None:
-    # Handlers may all wait for a database that hangs; this must not take one of their threads.
+    # All handlers may wait for a hanging database; this task must not take one of their threads.
     thread = CapacityLimiter(1)
     while True:
         await asyncio.sleep(EVERY_S)
@@ -44,5 +44,5 @@ async def _evaluate(app: App) -> None:
         try:
             await run_sync(app.part(Alarms).evaluate_by_clock, limiter=thread)
         except Exception as error:
-            # The records are out of reach for a while; it is looked for again.
+            # The database is unavailable for a while; the next round tries again.
             log.warning("silent spacecraft could not be looked for: %s", error)

@@ -32,7 +32,7 @@ from service.trends.quantities import QuantityName, quantity_named
 LimitsInForce = Mapping[quantities.Subject, LimitSettings]
 
 _SHIPPED: dict[tuple[str, tuple[str, ...]], Mapping[QuantityName, LimitSettings]] = {}
-# Run with every batch of a live spacecraft.
+# This query runs with every batch of a live spacecraft.
 _IN_FORCE = prepared(
     select(limits).where(
         limits.c.spacecraft == bindparam("of_spacecraft"), limits.c.until.is_(None)
@@ -42,7 +42,7 @@ _IN_FORCE = prepared(
 
 def limits_of(connection: Connection, mission: Mission) -> LimitsInForce:
     """Limits in force for a spacecraft and its trackers: shipped defaults unless set."""
-    # Read with every batch; a process meets few missions.
+    # Limits are read with every batch; a process has few missions.
     key = mission.digest, quantities.limited_names()
     shipped = _SHIPPED.get(key)
     if shipped is None:
@@ -57,7 +57,7 @@ def limits_of(connection: Connection, mission: Mission) -> LimitsInForce:
 
 @lru_cache(maxsize=256)
 def _read(settings: str) -> LimitSettings:
-    # One object for one text: a window remembers by identity the limits that it is within.
+    # Equal texts give one object: a window compares its limits by identity.
     return LimitSettings.model_validate_json(settings)
 
 
@@ -346,7 +346,7 @@ def alarm_spans(
 
     Only intervals that touch the period from `start` up to `end` count, and only the newest alarms.
     """
-    # Texts are in the order of time but for the length of their fractions.
+    # Texts of times sort correctly except for different lengths of their fractions.
     chosen = (
         select(alarms)
         .where(

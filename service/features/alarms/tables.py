@@ -19,9 +19,9 @@ limits = sa.Table(
     sa.Column("id", sa.Integer, primary_key=True),
     sa.Column("spacecraft", Name, nullable=False),
     sa.Column("quantity", sa.String(32), nullable=False),
-    # Empty: of the spacecraft as a whole.
+    # Empty text: the limit is for the spacecraft as a whole.
     sa.Column("tracker", Name, nullable=False, server_default=sa.text("''")),
-    # JSON; null: the shipped ones hold again.
+    # JSON; null: the shipped limits apply again.
     sa.Column("settings", sa.Text),
     sa.Column("who", sa.String(64), nullable=False),
     sa.Column("comment", sa.Text),
@@ -59,9 +59,9 @@ alarms = sa.Table(
     sa.Column("spacecraft", Name, nullable=False),
     sa.Column("run", RunName, nullable=False),
     sa.Column("quantity", sa.String(32), nullable=False),
-    # Empty: of the spacecraft as a whole.
+    # Empty text: the alarm is for the spacecraft as a whole.
     sa.Column("tracker", Name, nullable=False, server_default=sa.text("''")),
-    # The worst so far, and that of now: null is back in limits.
+    # Worst severity so far, and present severity: null is back in limits.
     sa.Column("severity", sa.String(16), nullable=False),
     sa.Column("current_severity", sa.String(16)),
     sa.Column("raised_at", Moment, nullable=False),

@@ -95,7 +95,7 @@ class SampleWindow:
             samples = [each for each in samples if each > self.samples[0]]
         taken = [*self.samples, *samples]
         in_order = sorted(taken)
-        # In whatever order they come, a mean lies between the least and the greatest.
+        # The order of samples is irrelevant: a mean lies between the least and the greatest.
         each_within = _each_within(taken, limits)
         within = each_within or (
             taken == in_order and _all_within(_means(taken, count, len(self.samples)), limits)
@@ -134,7 +134,7 @@ class SampleWindow:
             "samples": self.samples,
             "since_ns": {s.word: t for s, t in self.since_ns.items()},
         }
-        # Most are in limits, and the text is written with every batch.
+        # Most windows are within limits, and the text is written with every batch.
         if self.worst:
             kept["worst"] = {s.word: tuple(point) for s, point in self.worst.items()}
         return kept

@@ -136,7 +136,7 @@ def eliminate(
     """
     batches = int(edges[-1])
     matrix = np.zeros((len(edges) - 1, unknowns + 1, unknowns + 1))
-    # The residuals are one more column, after those of the unknowns.
+    # Residuals form one more column, after the columns of the unknowns.
     coupling = np.zeros((batches, 3, unknowns + 1))
     own_blocks = np.zeros((3, 3, batches))
     for part in parts:

@@ -247,7 +247,7 @@ class BackgroundCalibrations:
         except AcquisitionError as error:
             ended = {"state": "failed", "fault": str(error)}
         except Exception:
-            # Whatever fails, the calibration must end: a client waits for its state.
+            # The calibration must end after any error: a client waits for its state.
             log.exception("calibration %s failed", id)
             fault = "the fault is on the service's side; it is logged"
             ended = {"state": "failed", "fault": fault}
@@ -260,7 +260,7 @@ class BackgroundCalibrations:
                 return
             except (AcquisitionError, SQLAlchemyError) as error:
                 log.warning("the end of calibration %s cannot be recorded yet: %s", id, error)
-            # After this another service, or the next start, records it as interrupted.
+            # Later another service, or the next start, records the calibration as interrupted.
             if self._closed.wait(SAVED_EVERY_S):
                 return
 

@@ -158,7 +158,7 @@ def start_calibration(body: JsonBody, app: AppDep, change: ChangeDep) -> Respons
 
 @router.serves(
     "GET /calibrations/{id}",
-    # Of tokens that are bound to spacecraft only calibrations of these: see the handlers.
+    # A token bound to spacecraft may use calibrations of these only: the handlers check it.
     Policy("read", "nothing"),
     Returns("The calibration.", models.Calibration),
 )

@@ -84,7 +84,7 @@ def run(parsed: Namespace) -> int:
     try:
         servers, stream = server_and_stream(parsed.source)
     except ValueError as error:
-        # The address may hold a password: it is not shown.
+        # No address in the message: it may contain a password.
         raise BadInput(Fault("SOURCE", str(error))) from None
     source = Source(
         servers,
@@ -110,7 +110,7 @@ def run(parsed: Namespace) -> int:
             try:
                 await follower.run(parsed.until_empty)
             except ExceptionGroup as errors:
-                # Of the messages at work together: one says why.
+                # Of several simultaneous messages one error explains the end.
                 raise errors.exceptions[0] from None
 
     if parsed.metrics_port is not None:

@@ -349,7 +349,7 @@ class Follower:
                 self._metrics.count("refused")
                 return
             except Exception:
-                # The problem is the token's, for example, not the message's: leave it to others.
+                # The problem is, for example, the token's, not the message's: others may try it.
                 await message.nak()
                 raise
             else:
@@ -377,7 +377,7 @@ class Follower:
         }
         try:
             if _size_of(headers) + len(body) > self._connection.max_payload:
-                # NATS would end the connection.
+                # NATS would end the connection after a larger message.
                 raise MaxPayloadError
             if time.monotonic() < self._unkept_until_s.get(subject, 0.0):
                 await self._connection.publish(subject, body, headers=headers)
@@ -386,7 +386,7 @@ class Follower:
         except NoStreamResponseError:
             log.debug("no stream keeps %s, and nobody subscribes to it", subject)
         except NatsTimeout:
-            # A subscriber has it, but only a stream acknowledges it.
+            # A subscriber has received the message, but only a stream acknowledges it.
             with suppress(NotFoundError):
                 await stream.find_stream_name_by_subject(subject)
                 raise

@@ -23,7 +23,7 @@ from service.web.requests.problems import FAILED, INTERNAL_ERROR, problem_type_o
 from service.web.requests.request_body import MAX_JSON_BYTES, refused
 
 if TYPE_CHECKING:
-    # NATS comes with an extra.
+    # NATS is an optional dependency, imported only on use.
     from service.features.follow.follower import Submit
 
 log = logging.getLogger(__name__)
@@ -41,7 +41,7 @@ def source_of(settings: Settings) -> Source | None:
     try:
         servers, stream = server_and_stream(settings.follow)
     except ValueError:
-        # The address may hold a password: it is not shown.
+        # No address in the message: it may contain a password.
         raise errors.BadConfiguration(f"ACQUIRE_FOLLOW: {EXPECTED}") from None
     files = {
         "ACQUIRE_FOLLOW_CREDENTIALS": settings.follow_credentials,

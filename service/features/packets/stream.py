@@ -110,7 +110,7 @@ def packets_in(stream: IO[bytes], prefix_bytes: int = 0) -> Iterator[SpacePacket
                 "space packets first, or set packets.prefix_bytes if each packet has such a prefix"
             )
             raise EndOfPackets(number, offset, len(header), message)
-        # Later packets may begin so by chance.
+        # Only the first packet is checked: later ones may begin like a container by chance.
         marks = [mark for mark in CONTAINERS if number == 1 and header.startswith(mark)]
         if marks:
             message = (
@@ -200,7 +200,7 @@ class SegmentJoiner:
             has_header = segment.content[0] & 0x08
             data += segment.content[HEADER_BYTES + (self._header_bytes if has_header else 0) :]
         flags = bytes([first.content[2] | WHOLE << 6])
-        # A longer packet than the field can tell keeps the greatest length.
+        # The length field of a packet beyond 65,536 bytes has its greatest value.
         length = min(len(data) - 1, 0xFFFF).to_bytes(2, "big")
         header = first.content[:2] + flags + first.content[3:4] + length
         return SpacePacket(first.number, first.offset, header + data, len(segments))
@@ -226,7 +226,7 @@ class SequenceCounter:
         self._last[apid] = count
         if last is not None:
             skipped = (count - last - 1) % SEQUENCE_COUNTS
-            # More than half of all counts is read as a step backward.
+            # A step of more than half of all counts is a step backward.
             if skipped >= SEQUENCE_COUNTS // 2:
                 counts.backward += 1
             elif skipped:

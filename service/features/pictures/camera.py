@@ -127,7 +127,7 @@ def _write_maps(output: Path, found: "CameraCalibration") -> list[Path]:
     from service.imaging.overlay import draw_residuals
 
     size, usual_px = (found.lens.width_px, found.lens.height_px), max(found.rms_px[1], 1e-3)
-    # Before, the places are of all stars; after, without those that were left out.
+    # The first map has all stars, the second one only those used in the fit.
     drawn = {
         "before": (found.before_place_px, found.before_px),
         "after": (found.place_px, found.after_px),

@@ -476,7 +476,7 @@ def _items(block: AttitudeBlock) -> Iterator[str]:
 
 def _plain(values: Texts) -> list[str]:
     plain = values.tolist()
-    # Many are the same.
+    # Many values are equal.
     texts = {value: _ENCODER.encode(value).decode() for value in set(plain)}
     return [texts[value] for value in plain]
 

@@ -108,7 +108,7 @@ def _interpolated(rows: attitudes.AttitudeBlock, after: int, moment: Utc) -> Att
     if attitudes.turns_far(rows)[after - 1]:
         motion: float | None = float(steps.error_rad[0]) * ARCSEC_PER_RADIAN
     else:
-        # The rates' noise would be more than what a cubic gains.
+        # A cubic would add more noise of the rates than accuracy.
         steps = steps_between(q[0], q[1], np.array([step_s]))
         change = float(np.linalg.norm(np.diff(rows.rate_deg_per_s[pair], axis=0))) * 3600.0
         motion = None if np.isnan(change) else max(change * step_s, missed) / 8.0

@@ -70,7 +70,7 @@ def attitude_pages(
 def _columns(rows: Sequence[Any]) -> AttitudeRows:
     time_ns, _, id, status, batch, time, sent, method, *numbers = zip(*rows, strict=True)
     values = np.array(numbers, dtype=np.float64)
-    # In the table they are zero.
+    # Missing values are zero in the database.
     values[10:12, np.array(method, dtype=object) == METHOD] = np.nan
     rates = [RECORDED_RATES.decode(each).body_rates_deg_per_s for each in sent]
     return AttitudeRows(

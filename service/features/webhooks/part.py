@@ -198,11 +198,11 @@ class Webhooks:
         """Queue stored events of a period again, if they pass the filters of the webhook."""
         known, now, is_open = _known(id), utc_now().text, self._access.is_open
         end = utc_now() if until is None else until
-        # Not in the writer, which others would wait for.
+        # Read outside the writer, which other changes would wait for.
         with self._context.reading() as connection:
             webhook = webhooks.registered_webhook(connection, known, now, is_open)
             kept = events_between(connection, since, end)
-        # What was not queued yet comes by itself.
+        # Events that were not queued yet are delivered in any case.
         found = [each for each in kept if each.id <= webhook.position]
         wanted = [each for each in found if wants(webhook, each)]
         rows = [delivery_row(known, each, now, again=True) for each in wanted]

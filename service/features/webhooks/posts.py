@@ -23,7 +23,7 @@ class CheckedTransport(httpx.AsyncBaseTransport):
     def __init__(self, allowed: Sequence[Network]) -> None:
         self._allowed = allowed
         context = httpx.create_ssl_context(trust_env=False)
-        # What the system trusts too, so that a site can add its own authority.
+        # Trust the system's authorities too, so that a site can add its own.
         context.load_default_certs()
         self._inner = httpx.AsyncHTTPTransport(
             verify=context,
@@ -38,8 +38,8 @@ class CheckedTransport(httpx.AsyncBaseTransport):
         Raises `Refused` for an address that must not be reached.
         """
         url = request.url
-        # As it is sent: decoded and encoded again by the rules of 2003, xn--fa-hia.example would
-        # be fass.example, which is somebody else's.
+        # Host as sent: decoded and encoded again by the rules of 2003, xn--fa-hia.example would
+        # become fass.example, which has another owner.
         host = url.raw_host.decode("ascii")
         addresses = await reachable_addresses(
             host,
@@ -52,7 +52,7 @@ class CheckedTransport(httpx.AsyncBaseTransport):
         limits = dict(request.extensions["timeout"])
         for address in addresses[:-1]:
             request.url = url.copy_with(host=address)
-            # One that does not answer leaves time for the others.
+            # An address that does not answer must leave time for the other addresses.
             share_s = {"connect": TOTAL_S / len(addresses)}
             request.extensions = {**request.extensions, "timeout": limits | share_s}
             try:
@@ -99,7 +99,7 @@ class Poster:
                     status = answer.status_code
                     retry_after_s = _retry_after_s(answer.headers.get("retry-after"))
                     received = 0
-                    # Raw: what unfolds is not read.
+                    # Raw bytes: compressed content could expand to any size.
                     async for piece in answer.aiter_raw():
                         received += len(piece)
                         if received > MAX_ANSWER_BYTES:

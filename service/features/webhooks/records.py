@@ -529,11 +529,10 @@ def _shown(row: Any) -> WebhookDelivery:
     )
 
 
-# Which process delivers: one of those that share a database.
+# Choice of the process that delivers, among processes that share a database.
 #
-# The process that delivers raises a number every few seconds.  Another takes over where
-# the number has stood still for a while by its own clock, so the clocks of two machines
-# are never compared.
+# The delivering process raises a number every few seconds.  Another process takes over if the
+# number has not changed for a while by its own clock, so clocks of two machines are never compared.
 
 
 def read_sender(connection: Connection) -> tuple[str | None, int]:

@@ -172,7 +172,7 @@ class WebhookSender:
             try:
                 await self._round()
             except Exception as error:
-                # The database is out of reach: nothing is lost, events are delivered later.
+                # The database is unavailable: nothing is lost, events are delivered later.
                 log.warning("webhooks are not delivered: %s", error)
                 await asyncio.sleep(POLL_S)
             with suppress(TimeoutError):
@@ -209,7 +209,7 @@ class WebhookSender:
     async def _queue_news(self, webhook: Registered, last: int, room: int) -> None:
         """Queue the events up to `last` that a webhook wants, while its queue has room."""
         position = self._positions.get(webhook.id, webhook.position)
-        # It is beyond `last` where events were recorded after `last` was read.
+        # `position` is beyond `last` if events were recorded after `last` was read.
         while position < last and room > 0:
             found, missed = await self._read(self._after, position)
             now = utc_now().text
@@ -227,7 +227,7 @@ class WebhookSender:
                 rows=rows,
             )
             if not await self._change(move):
-                # Another process moved it, or it was deleted: what is stored holds.
+                # The position was moved or the webhook deleted elsewhere: that state is valid.
                 self._positions.pop(webhook.id, None)
                 self.changed()
                 return
@@ -262,7 +262,7 @@ class WebhookSender:
         try:
             await self._deliver(queue)
         except Exception as error:
-            # One receiver's trouble must not end the task of all; its events are tried again.
+            # An error of one receiver must not end the task of all; its events are tried again.
             log.warning("the deliveries of a webhook were interrupted: %s", error)
         else:
             self._poke()
@@ -287,7 +287,7 @@ class WebhookSender:
                 if time.monotonic() - begun_s >= NOTED_AFTER_S:
                     break
         finally:
-            # Also where the service stops meanwhile.
+            # Recorded even if the service stops meanwhile.
             if receiver is not None and outcome is not None:
                 attempt = self._attempt(receiver, queue, done, failed, outcome)
                 await self._note(attempt)
@@ -309,7 +309,7 @@ class WebhookSender:
         now, unix_s = utc_now().text, int(time.time())
         headers = messages.signed_headers(webhook.secrets(now), message_id, unix_s, body)
         if self._poster is None:
-            # Not before: httpx, and the certificates of all authorities, take a while to read.
+            # Late import: httpx, and the certificates of all authorities, take a while to load.
             from service.features.webhooks.posts import Poster
 
             self._poster = Poster(self._allowed)

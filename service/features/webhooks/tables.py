@@ -61,10 +61,10 @@ webhook_deliveries = sa.Table(
     sa.Column("event_id", sa.BigInteger, primary_key=True, autoincrement=False),
     sa.Column("message_id", sa.String(48), nullable=False),
     sa.Column("kind", sa.String(16), nullable=False),
-    # Empty: the event is about no spacecraft or about every one.
+    # Empty text: the event is about no spacecraft or about all of them.
     sa.Column("spacecraft", Name, nullable=False),
     sa.Column("body", sa.Text, nullable=False),
-    # Asked for again: new events of the spacecraft do not wait for it.
+    # Repeated on request: new events of the spacecraft do not wait for it.
     sa.Column("again", sa.Boolean, nullable=False),
     sa.Column("dead", sa.Boolean, nullable=False),
     sa.Column("queued", Moment, nullable=False),

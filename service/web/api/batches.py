@@ -120,7 +120,7 @@ async def submit_batches(
         read = await app.submissions.read_array(body)
     except BadInput as error:
         raise refused(body, error) from None
-    # Beside the one that every request counts as.
+    # One request is counted already.
     app.access.count_request(caller, len(read) - 1)
     outcomes = await app.submissions.answered_each(read, caller)
     for each in outcomes:

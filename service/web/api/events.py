@@ -60,7 +60,7 @@ class EventStream(Response):
             try:
                 await self._send(send)
             finally:
-                # Also for lines that were never begun: their own `finally` would not run.
+                # Leave also if no line was ever sent: the `finally` of the lines would not run.
                 self._leave()
                 with anyio.CancelScope(shield=True):
                     await self._lines.aclose()  # type: ignore[attr-defined]

@@ -282,7 +282,7 @@ async def _require_spacecraft_access(
         id = request.path_params["id"]
         owner = await run_sync(app.results.spacecraft_of, id, limiter=_OWNER_THREADS)
         if owner is None or not caller.may_see(owner):
-            # As if it did not exist: probing for ids of others must tell nothing.
+            # Same answer as for an unknown id: probing must not reveal batches of other spacecraft.
             raise NotFound(f"there is no batch with the id {id[:80]!r}")
     elif place == "every":
         require_all_spacecraft(caller)

@@ -319,7 +319,7 @@ def _no_idempotency_key(message: str) -> Any:
     async def require_none(request: Request) -> None:
         key = request.headers.get("Idempotency-Key")
         if key is not None:
-            # Ignored, it would let a client believe something of it.
+            # An ignored key would let a client rely on it.
             raise BadBatch(Fault("Idempotency-Key", message, shown_value(key)))
 
     return Depends(require_none)

@@ -75,7 +75,7 @@ def build_liebe(stars: RunCatalog) -> Liebe:
     star, feature = features(stars.direction)
     order = np.argsort(feature[:, 0], kind="stable")
     star, feature = star[order], feature[order]
-    # As in flight, single precision: a hundredth of an arcsecond.
+    # Single precision as in flight: a hundredth of an arcsecond.
     return Liebe(
         read_only(star),
         read_only(feature.astype(np.float32)),

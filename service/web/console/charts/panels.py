@@ -117,7 +117,7 @@ class Values:
         """SVG paths of the values; unknown ones are left out."""
         known = np.isfinite(self.value)
         joins = self.joins if len(self.joins) else np.zeros(len(known), dtype=bool)
-        # One that follows an unknown one begins a part.
+        # A value after an unknown one begins a new part.
         joins = (joins & np.append(False, known[:-1])[: len(known)])[known]
         x, y = axis.x(self.time_ns[known]), scale.y(self.value[known])
         parts = parts_of(joins)

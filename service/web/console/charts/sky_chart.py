@@ -23,10 +23,10 @@ MARK_RADIUS = 13.0
 RIVAL_MARGIN = 6.0
 
 
-# Where numbers and names stand in the picture of a star field: none over another one.
+# Positions of numbers and names in the picture of a star field, without overlaps.
 #
-# Every text is put at the first free place about its star, close ones first.  The
-# text's size is estimated, a little larger than browsers draw it.
+# Every text is placed at the first free position about its star, close ones first.  The size of
+# the text is estimated, slightly larger than browsers draw it.
 
 Place = tuple[float, float]
 Box = tuple[float, float, float, float]
@@ -149,7 +149,7 @@ def _places(
     for gap in GAPS:
         for right, down in directions:
             away = gap * (ASIDE if right and down else 1.0)
-            # A half of the text on either side, or all of it on one.
+            # Half of the text on either side, or all of it on one side.
             left = at[0] + right * away + (right - 1) / 2 * width
             top = at[1] + down * away + (down - 1) / 2 * height
             x = left + (1 - right) / 2 * width

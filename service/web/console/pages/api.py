@@ -42,8 +42,8 @@ def api_shapes_page(request: Request, query: FromQuery[PageQuery]) -> Response:
     return rendered("api.html.jinja", layout, heading="API: shapes", reference=shown)
 
 
-# Made once: anybody may ask for these pages, without a token.  Of one app only: a program that
-# opens and closes several keeps no other.
+# Made once, since anybody may request these pages without a token; and kept for one app only, as a
+# program may open and close several.
 @lru_cache(maxsize=1)
 def _operations(app: FastAPI) -> Markup:
     document = app.openapi()

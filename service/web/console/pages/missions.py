@@ -88,7 +88,7 @@ def missions_page(query: FromQuery[MissionsQuery], context: ContextDep) -> Respo
         known=[context.app.context.known[name] for name in names],
         changed=changed,
         query=query,
-        # Its text may name the missions of others.
+        # The error text may name missions of other spacecraft.
         unreadable=unreadable if context.caller.spacecraft is None else None,
         symbols=SYMBOLS,
     )

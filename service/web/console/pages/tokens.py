@@ -38,7 +38,7 @@ def audit_page(query: FromQuery[AuditPageQuery], context: ContextDep) -> Respons
             ROWS,
             query.cursor,
             person=query.person.strip(),
-            # As the page writes an action, or as the API names it.
+            # Accept an action as written on the page, or as named by the API.
             action=query.action.strip().replace(" ", "_"),
             about=query.about.strip(),
         )
