@@ -154,12 +154,19 @@ def test_where_white_is_zero_the_counts_are_turned_over(rng, kind):
         # Its pixels would be out of place, and an attitude from them wrong.
         (lambda v: with_tag(tiff(v), 273, 16), "over its tags"),
         (lambda v: with_first_strip_moved(tiff(v, rowsperstrip=7), 2), "over each other"),
+        (lambda v: with_first_strip_moved(tiff(v, rowsperstrip=7), 14 * COLUMNS), "not blank"),
     ],
 )
 def test_what_is_not_read_of_a_tiff_is_refused_by_its_name(rng, make, word):
     with pytest.raises(BadFile, match=word) as refusal:
         read(make(drawn(rng, "u2")))
     assert "Buffered" not in str(refusal.value)
+
+
+def test_blank_strips_of_a_tiff_may_share_their_bytes():
+    values = np.full((ROWS, COLUMNS), 7, "u2")
+    data = with_first_strip_moved(tiff(values, rowsperstrip=7), 14 * COLUMNS)
+    assert np.array_equal(read(data).counts, values)
 
 
 def with_tag(data, tag, value):

@@ -9,6 +9,7 @@ import io
 import logging
 import math
 import struct
+from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
@@ -164,11 +165,14 @@ def _light(page: Any, file: BoundedFile) -> tuple[npt.NDArray[Any], float]:
         # Sums of three 16-bit numbers are exact in single precision's 24 bits too.
         whole = np.dtype("i4" if dtype.kind in "ui" and dtype.itemsize < 4 else "f8")
     light = np.zeros((page.imagelength, page.imagewidth), whole)
+    uses = Counter(page.dataoffsets)
     for index, data in _segments(page, file, packed):
         plain = _undone(data, page) if unpredict else data
         part, (plane, _, row, column, _), (_, rows, columns, _) = page.decode(plain, index)
         rows = min(rows, light.shape[0] - row)
         columns = min(columns, light.shape[1] - column)
+        if uses[page.dataoffsets[index]] > 1 and part.min() != part.max():
+            raise bad_frame("has strips or tiles that share their bytes and are not blank")
         if plane < colours:
             part = part[0, :rows, :columns, :colours]
             light[row : row + rows, column : column + columns] += part.sum(axis=2, dtype=whole)
@@ -244,7 +248,7 @@ def _require_apart(page: Any) -> None:
         for tag in page.tags
         if tag.valuebytecount > form.offsetsize
     }
-    # Identical offsets are allowed: blank tiles may share their bytes.
+    # Identical offsets are allowed here: blank tiles may share their bytes.
     pairs = zip(page.dataoffsets, page.databytecounts, strict=True)
     spans |= {(at, at + size, True) for at, size in pairs}
     tags_end = data_end = 0
