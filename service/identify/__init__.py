@@ -1,1 +1,1 @@
-"""Identification: which catalog star each observed star is."""
+"""Star identification: which catalog star each observed star is."""

@@ -1,4 +1,4 @@
-"""From identified stars to what an attitude is solved from: pairs of vectors, in one pass."""
+"""Attitudes from identified stars: vector pairs of observed and catalog stars, and their fit."""
 
 import math
 from typing import Any, NamedTuple
@@ -21,7 +21,7 @@ from service.identify.identification import Integers
 from service.vectors import Vector
 
 SUN_SCHWARZSCHILD_AU = 1.97412574336e-8
-"""The Sun's gravitational radius, as ERFA has it."""
+"""The Sun's gravitational radius in au, with ERFA's value."""
 
 
 def attitude_of(
@@ -35,10 +35,10 @@ def attitude_of(
     sun_distance_au: float,
     method: str,
 ) -> AttitudeSolution | NoAttitude:
-    """`solve_attitude` of the `matched_vectors` of n stars, in one compiled call.
+    """The attitude solution of n identified stars, in one compiled call.
 
-    `tracker_of` (n,) may be None where there is one of `trackers`.  The
-    solution's residuals have one row an observed star, NaN for those without an
+    It is `solve_attitude` of the `matched_vectors`. `tracker_of` (n,) may be None for a single
+    tracker. The solution's residuals have one row per observed star, NaN for stars without an
     identity.
     """
     fits = room_for_fits(1, len(star))
@@ -70,7 +70,7 @@ def with_tracker_fits(
     tracker_of: Integers,
     trackers: tuple[str, ...],
 ) -> AttitudeSolution:
-    """The solution of stars of several trackers, with how those of each agree with it."""
+    """An attitude solution extended by the agreement of each tracker's stars with the attitude."""
     observed, reference, sigma = matched_vectors(
         direction_body, sigma_rad, star, catalog_direction, velocity_c, sun_distance_au
     )
@@ -80,12 +80,12 @@ def with_tracker_fits(
 
 
 class FitColumns(NamedTuple):
-    """The attitudes of n batches with m stars in all, as kernels write them.
+    """The attitude solutions of n batches with m stars in all, as arrays filled by kernels.
 
-    `matched` (n,) is how many stars of a batch have an identity, or -1 where they are enough and
-    yet give no attitude.  The others are those of `FitWorkspace`, by batch (n, ...) and by star,
-    and hold nothing where there is no attitude: `residual_arcsec` (m,) is NaN for stars without
-    an identity.
+    `matched` (n,) is the number of identified stars of a batch, or -1 if there are enough but their
+    geometry gives no attitude. The other fields are those of `FitWorkspace`, by batch (n, ...) or
+    by star, and undefined for batches without an attitude; `residual_arcsec` (m,) is NaN for stars
+    without an identity.
     """
 
     matched: Any
@@ -96,14 +96,14 @@ class FitColumns(NamedTuple):
     figures: Any
 
     def is_good(self, row: int) -> bool:
-        """True if a batch has an attitude that its residuals do not contradict."""
+        """True if a batch has an attitude that is consistent with its residuals."""
         matched = int(self.matched[row])
         return matched >= 2 and bool(self.figures[row, TASTE] <= taste_bound(2 * matched - 3))
 
     def of_batch(
         self, row: int, first: int, last: int, method: str
     ) -> AttitudeSolution | NoAttitude:
-        """The attitude of a batch, whose stars are rows from `first` to before `last`."""
+        """The attitude solution of a batch, whose stars are rows from `first` to before `last`."""
         matched = int(self.matched[row])
         if matched < 0:
             return NoAttitude.DEGENERATE_GEOMETRY
@@ -120,7 +120,7 @@ class FitColumns(NamedTuple):
 
 
 def room_for_fits(batches: int, stars: int) -> FitColumns:
-    """Columns for the attitudes of so many batches and stars."""
+    """Empty arrays for the attitude solutions of given numbers of batches and stars."""
     return FitColumns(
         matched=np.zeros(batches, np.int64),
         quaternions=np.empty((batches, 3, 4)),
@@ -145,11 +145,11 @@ def fit_sightings(  # type: ignore[no-untyped-def]
     chosen,
     fits,
 ):
-    """The attitudes of those of n batches that `which` names, from the stars of all trackers.
+    """Solve the attitudes of the batches named by `which`, each from the stars of all its trackers.
 
     The stars of batch i are rows from `offsets[i]` to before `offsets[i + 1]`; `velocity` (n, 3)
-    and `sun_distance_au` (n,) are by batch.  It keeps the interpreter's lock: where others wait
-    for that, it takes longer to get it back than to solve for some attitudes.
+    and `sun_distance_au` (n,) are by batch. The function keeps the interpreter's lock, since
+    acquiring the lock again may take longer than solving a few attitudes.
     """
     for i in which:
         first, last = offsets[i], offsets[i + 1]
@@ -186,7 +186,7 @@ def fit_sightings(  # type: ignore[no-untyped-def]
 def matched_vectors(  # type: ignore[no-untyped-def]
     direction_body, sigma_rad, star, catalog_direction, velocity, sun_distance_au
 ):
-    """Observed (N, 3) in body axes, reference (N, 3) inertial, and sigmas (N,) of the unique stars.
+    """Body vectors (N, 3), inertial reference vectors (N, 3) and sigmas (N,) of identified stars.
 
     `star` (n,) holds rows of the run catalog, -1 for stars without one.  The
     references are apparent as a moving observer sees them; a `velocity` of zero
@@ -196,7 +196,7 @@ def matched_vectors(  # type: ignore[no-untyped-def]
     for k in range(len(star)):
         if star[k] >= 0:
             count += 1
-    # One array: to make arrays and to cut them takes longer than the rest.
+    # One array, because allocating and slicing several arrays would take longer than the rest.
     both = np.empty((2, count, 3))
     observed, reference = both[0], both[1]
     sigma = np.empty(count)
@@ -217,13 +217,13 @@ def match(
     reference: Vector,
     sigma: Vector,
 ) -> int:
-    """`matched_vectors` into arrays that are long enough; how many there are."""
+    """Fill long enough arrays with the result of `matched_vectors`; returns the number of stars."""
     at_rest = velocity[0] == 0.0 and velocity[1] == 0.0 and velocity[2] == 0.0
     at = 0
     for k in range(len(star)):
         row = star[k]
         if row >= 0:
-            # Number by number, as is quickest.
+            # Copying number by number is fastest.
             for i in range(3):
                 observed[at, i] = direction_body[k, i]
                 reference[at, i] = catalog_direction[row, i]
@@ -236,9 +236,9 @@ def match(
 
 @njit_no_refcount
 def aberrate(natural, velocity, sun_distance_au, apparent):  # type: ignore[no-untyped-def]
-    """The apparent direction of a natural one, by the formula of ERFA's `ab`.
+    """The apparent direction of a star for a moving observer, by the formula of ERFA's `ab`.
 
-    ERFA's own is called wherever a call may cost what numpy's calls do.
+    ERFA's own function is used wherever the overhead of a numpy call is acceptable.
     """
     speed2 = velocity[0] ** 2 + velocity[1] ** 2 + velocity[2] ** 2
     if speed2 == 0.0:

@@ -1,4 +1,4 @@
-"""The result of an identifier: an identity for each star of one tracker."""
+"""The result of star identification: an identity for each star of one tracker."""
 
 from enum import IntEnum
 from functools import lru_cache
@@ -13,11 +13,11 @@ from service.vectors import Vector, read_only
 Integers = npt.NDArray[np.int64]
 
 MAX_RIVALS = 20
-"""The most rivals listed for a star; the identifiers look for one more, to tell a cut list."""
+"""Largest number of listed rivals of a star; identifiers find one more to detect a cut list."""
 
 
 class Outcome(IntEnum):
-    """What became of one observed star."""
+    """The outcome of the identification of one observed star."""
 
     UNMATCHED = 0
     UNIQUE = 1
@@ -25,7 +25,7 @@ class Outcome(IntEnum):
 
     @property
     def word(self) -> str:
-        """The outcome as the interface writes it."""
+        """The outcome in the lower-case spelling of the interface."""
         return self.name.lower()
 
 
@@ -35,18 +35,15 @@ _UNIQUE = int(Outcome.UNIQUE)  # numpy compares with a plain number several time
 class Identification(Struct, frozen=True, eq=False, gc=False):
     """The identification of one tracker's stars, row by row in the order observed.
 
-    `star` is the row in the run catalog of the unique winner, -1 without one.
-    `votes` and `runner_up` are STARID's highest and second-highest tallies,
-    equal in a tie.  `rivals` are the rows that a star without a winner may be:
-    the tied ones, brightest first, or where the identifier gives probabilities
-    all that are likely enough, by falling `rival_probability`.  `probability`,
-    NaN where the identifier gives none, is that of the winner, of an ambiguous
-    star's first rival, or that an unmatched star is none of the catalog's.
-    `rivals_cut` counts the stars with more rivals than are listed.
-    `bounded`: the search ended at the most work allowed, and what it did not
-    see may rival.  `hypothesis` is the likeliest star of each under one attitude,
-    -1 where that explains none, and None where the identifier weighs no
-    hypotheses.  `mirrored`: a mirror image of the field fits the sky better.
+    `star` is the row in the run catalog of the unique winner, -1 without one. `votes` and
+    `runner_up` are STARID's highest and second-highest tallies, equal in a tie. `rivals` are the
+    possible rows of a star without a winner: the tied ones, brightest first, or with probabilities
+    all likely ones, by decreasing `rival_probability`. `probability`, NaN if the identifier gives
+    none, is that of the winner, of an ambiguous star's first rival, or of an unmatched star being
+    no catalog star. `rivals_cut` counts the stars with more rivals than are listed. `bounded`: the
+    search ended at its work limit and may have missed rivals. `hypothesis` is the most likely row
+    of each star under one attitude, -1 if unexplained, and None if the identifier weighs no
+    hypotheses. `mirrored`: a mirror image of the field fits the sky better.
     """
 
     outcome: Integers
@@ -63,18 +60,20 @@ class Identification(Struct, frozen=True, eq=False, gc=False):
 
     @property
     def explained(self) -> npt.NDArray[np.bool_]:
-        """Mask of the stars that the likeliest hypothesis, or a unique winner, explains."""
+        """True for the stars explained by the most likely hypothesis, or else by a unique
+        winner.
+        """
         return np.asarray((self.star if self.hypothesis is None else self.hypothesis) >= 0)
 
     @property
     def unique(self) -> npt.NDArray[np.bool_]:
-        """Mask of the stars with a unique winner."""
+        """True for the stars with a unique winner."""
         return np.asarray(self.outcome == _UNIQUE)
 
 
 @lru_cache(maxsize=256)
 def not_known(n: int) -> Vector:
-    """NaN for each of n stars: a probability or a residual that there is not; locked."""
+    """A read-only array of NaN for n stars, for unknown probabilities or residuals."""
     return read_only(np.full(n, np.nan))
 
 
@@ -91,13 +90,13 @@ def nothing_known(n: int) -> Identification:
 
 
 class IdentifiedColumns(NamedTuple):
-    """The identifications of k sightings with m stars in all, as kernels write them.
+    """The identifications of k sightings with m stars in all, as arrays filled by kernels.
 
-    Of each star, as in `Identification`: `outcome`, `star`, `votes`, `runner_up`, `probability`
-    and `hypothesis` (m,), and `rivals` and `rival_probability` (m, MAX_RIVALS + 1), whose rows
-    end with -1 in the place of a star.  Of each sighting: `bounded`, `mirrored`, `rivals_cut` and
-    `explained` (k,), how many stars the hypothesis explains.  Votes alone leave `probability`,
-    `rival_probability`, `hypothesis` and `explained` as they were.
+    By star, as in `Identification`: `outcome`, `star`, `votes`, `runner_up`, `probability` and
+    `hypothesis` (m,), and `rivals` and `rival_probability` (m, MAX_RIVALS + 1), whose rows end with
+    -1 instead of a star. By sighting: `bounded`, `mirrored`, `rivals_cut` and `explained` (k,), the
+    number of stars that the hypothesis explains. Vote counting leaves `probability`,
+    `rival_probability`, `hypothesis` and `explained` unchanged.
     """
 
     outcome: Any
@@ -114,9 +113,9 @@ class IdentifiedColumns(NamedTuple):
     explained: Any
 
     def of_sighting(self, s: int, first: int, last: int, weighs: bool) -> Identification:
-        """The identification of a sighting, whose stars are rows from `first` to before `last`.
+        """The identification of one sighting, whose stars are rows from `first` to before `last`.
 
-        `weighs`: by hypotheses, not by votes.
+        `weighs` is true for an identifier by hypotheses, false for one by votes.
         """
         n = last - first
         rivals = _none(n)
@@ -146,7 +145,7 @@ class IdentifiedColumns(NamedTuple):
 
 
 def room_for_identities(sightings: int, stars: int) -> IdentifiedColumns:
-    """Columns for so many sightings and stars."""
+    """Empty arrays for the identifications of given numbers of sightings and stars."""
     integers, counts = np.empty((5, stars), np.int64), np.zeros((2, sightings), np.int64)
     outcome, star, votes, runner_up, hypothesis = integers
     return IdentifiedColumns(

@@ -1,8 +1,8 @@
-"""The a priori knowledge as a presumed attitude, and the search region of each tracker.
+"""The conversion of a priori knowledge to a presumed attitude and to search regions of trackers.
 
-The presumed attitude carries observed vectors to inertial axes for the tests
-of geometry.  Where the roll is unknown it is made up, and the tests that would
-depend on it are switched off or, in a band, only vote.
+The presumed attitude carries observed vectors to inertial axes for the tests of geometry. An
+unknown roll is chosen arbitrarily, and tests that depend on the roll are switched off or, in a
+band, only vote.
 """
 
 import math
@@ -36,18 +36,20 @@ from service.vectors import (
 
 POLE_FROM_SUN_WARNING_DEG = 1.0
 SUN_FROM_EARTH_GROWTH_DEG = 0.3
-"""From Earth's centre the Sun is up to 0.26 deg from where a halo orbit about L1 sees it."""
+"""Zone margin in degrees for the Sun seen from Earth's centre, 0.26 deg from its direction at
+L1.
+"""
 SAME_BORESIGHT_DEG = 0.01
 PARALLEL_COS = 0.999999
-"""The cosine beyond which one direction does not fix a plane with another."""
+"""Cosine from which two directions are too parallel to define a plane."""
 
 
 class PriorAttitude(Struct, frozen=True, eq=False, gc=False):
-    """The presumed attitude (3, 3), inertial to body, and what is not known of it.
+    """The presumed attitude (3, 3), inertial to body, with its uncertainty.
 
-    `axis` (inertial) is where it has the zone's body axis.  `known_axis`
-    (inertial) is what alone is known where the roll is not: the boresight, or in
-    a band the pole, about which any rotation may come.
+    `axis` (inertial) is the direction of the zone's body axis at that attitude. `known_axis`
+    (inertial) is the only known direction if the roll is unknown: the boresight, or in a band the
+    pole, about which any rotation is possible.
     """
 
     attitude: Matrix
@@ -57,25 +59,25 @@ class PriorAttitude(Struct, frozen=True, eq=False, gc=False):
     growth_deg: float = 0.0
     warnings: tuple[str, ...] = ()
     predicted: PredictedPrior | None = None
-    """What the attitude was predicted with, if it was: its zones are caps about each boresight."""
+    """Prediction behind the attitude, or None; its search zones are caps about each boresight."""
     pole_body: Vector | None = None
-    """The measured direction of the pole in the body; None: along the zone's body axis."""
+    """The measured direction of the pole in body axes; None for the zone's body axis."""
 
     def axis_body(self, mission: Mission) -> Vector:
-        """The body axis (3,) that lies along `axis`."""
+        """The body axis (3,) that is presumed to lie along `axis`."""
         return mission.axis_body if self.pole_body is None else self.pole_body
 
 
 def prior_attitude(
     prior: APriori, time: Utc, mission: Mission, position_km: Vector | None = None
 ) -> PriorAttitude:
-    """The presumed attitude of a batch of that time, seen from a geocentric position where known.
+    """The presumed attitude for a batch's prior, time and optional geocentric position.
 
-    Raises `BadBatch` where the kind of prior does not fit the mission's zone.
+    Raises `BadBatch` if the kind of prior does not fit the mission's zone.
     """
     if isinstance(prior, QuaternionPrior):
         attitude = np.empty((3, 3))
-        # From another process it comes as an array that can be written: a kernel of its own.
+        # An array from another process is writable, for which a kernel would compile anew.
         to_matrix(locked(prior.quaternion), attitude)
         axis = np.dot(mission.axis_body, attitude)
         if isinstance(prior, PredictedPrior):
@@ -139,9 +141,10 @@ def _sun_pointed(prior: SunPointedPrior, time: Utc, mission: Mission) -> PriorAt
 
 
 def _frame(first: Vector, second: Vector) -> Matrix:
-    """Rows: the first direction, the normal to both, and the third of the right-handed set.
+    """A right-handed frame as rows: a direction, the normal to it and a second one, and the third
+    axis.
 
-    A second direction along the first gives way to a coordinate axis.
+    A second direction parallel to the first is replaced by a coordinate axis.
     """
     if abs(float(first @ second)) > PARALLEL_COS:
         second = np.eye(3)[int(np.argmin(np.abs(first)))]
@@ -150,7 +153,7 @@ def _frame(first: Vector, second: Vector) -> Matrix:
 
 
 def _any_roll(body_axis: Vector, inertial_axis: Vector) -> Matrix:
-    """Some attitude that carries an inertial direction to a body axis."""
+    """An arbitrary attitude that maps an inertial direction to a body axis."""
     return _frame(body_axis, body_axis).T @ _frame(inertial_axis, inertial_axis)
 
 
@@ -164,13 +167,12 @@ def _pole_warnings(pole: Vector, time: Utc, position_km: Vector | None) -> tuple
 def search_region(
     tracker: Tracker, presumed: PriorAttitude, mission: Mission, field_name: str
 ) -> SearchRegion:
-    """The region in which the stars of a tracker are searched for.
+    """The region of the sky in which a tracker's stars are searched.
 
-    In a cap, about the tracker's own presumed boresight; in a band, at the
-    boresight's coelevation from the pole, which changes by as much as a pole that was measured
-    beside the zone's axis is nearer to the boresight or farther.  About a predicted attitude it
-    is the field of view with a margin, in bands too.  Raises `BadBatch` for a tracker whose
-    boresight an a priori direction with unknown roll does not tell.
+    For a cap mission the region is centred on the tracker's presumed boresight; for a band mission
+    it is at the boresight's coelevation from the pole, corrected for a measured pole. For a
+    predicted attitude it is the field of view with a margin. Raises `BadBatch` for a tracker whose
+    boresight cannot be derived from a direction with unknown roll.
     """
     zone = mission.zone
     if presumed.predicted is not None:
@@ -206,9 +208,9 @@ def search_region(
 def _pole_shift_deg(
     tracker: Tracker, presumed: PriorAttitude, mission: Mission
 ) -> tuple[float, float]:
-    """Bounds of what a measured pole adds to the coelevation of a tracker's boresight.
+    """Bounds on the change of a boresight's coelevation by a measured pole, in degrees.
 
-    They are on the zone's grid, so that zones are shared while the pole moves a little.
+    They are rounded to the zone's grid, so that zones are reused while the pole moves a little.
     """
     if presumed.pole_body is None:
         return 0.0, 0.0

@@ -1,4 +1,4 @@
-"""What an identifier is given: one tracker's stars, and where to search for them."""
+"""The input of star identification: one tracker's stars, and where to search for them."""
 
 import math
 from typing import Any, NamedTuple
@@ -17,16 +17,15 @@ from service.vectors import Vector, separation_deg
 Integers = npt.NDArray[np.int64]
 
 PRIOR_ROTATION, PRIOR_DIRECTION = 0, 1
-"""Kinds of a priori knowledge: the whole attitude, or one direction with the roll unknown."""
+"""Kinds of a priori knowledge: a whole attitude, or one direction with unknown roll."""
 
 
 class SightedArrays(NamedTuple):
-    """A sighting's stars (n) as kernels take them.
+    """The stars (n) of one tracker in the form that kernels take.
 
-    `direction` (n, 3), `magnitude` (n,) with NaN for none, `sigma_rad` (n,), the
-    `boresight` (3,) and the observer's `velocity` (3,) in units of c are those of
-    `Sighting`.  `prior_axis` (3,) is the axis that a prior of kind
-    `PRIOR_DIRECTION` knows.
+    `direction` (n, 3), `magnitude` (n,) with NaN if unknown, `sigma_rad` (n,), the `boresight` (3,)
+    and the observer's `velocity` (3,) in units of c are those of `Sighting`. `prior_axis` (3,) is
+    the known axis for a prior of kind `PRIOR_DIRECTION`.
     """
 
     direction: Any
@@ -39,11 +38,11 @@ class SightedArrays(NamedTuple):
 
 
 class RegionBounds(NamedTuple):
-    """A search region as kernels take it.
+    """A search region on the sky in the form that kernels take.
 
-    A star lies in it whose angle to `axis` (3,) is from `least` to `most` radians.
-    In a band the zone's own axis, about which its angles are kept, lies `off_axis`
-    radians from it.  `all_inside`: the zone's stars are just those of the region.
+    It has the stars at `least` to `most` radians from `axis` (3,). In a band the cached zone's own
+    axis, to which stored polar angles refer, is `off_axis` radians from that axis. `all_inside`:
+    the cached zone has exactly the region's stars.
     """
 
     axis: Any
@@ -55,15 +54,14 @@ class RegionBounds(NamedTuple):
 
 
 class Sighting(Struct, frozen=True, eq=False, gc=False):
-    """One tracker's stars and where to search for them.
+    """The stars of one tracker, with the a priori knowledge and the zone for their identification.
 
-    `direction` (n, 3) is inertial through the presumed attitude; magnitudes may
-    be NaN; sigma is one standard deviation per tangent axis.  `zone` holds at
-    least the stars within `region`.  Of the presumed attitude the whole rotation
-    is known, or only where it points `known_axis` (inertial).  `velocity_c` of the
-    observer is zero where aberration is not to be corrected.  `boresight` is the
-    presumed one, inertial.  `guide` is there for identifiers that need it, None
-    for the others.  Identifiers spend of the `budget`, which a batch's sightings share.
+    `direction` (n, 3) is inertial through the presumed attitude; magnitudes may be NaN; sigma is
+    one standard deviation per tangent axis. `zone` has at least the stars within `region`. With
+    `known_axis` (inertial) only that axis of the presumed attitude is known, else the whole
+    rotation. `velocity_c` of the observer is zero if aberration is not corrected. `boresight` is
+    the presumed one, inertial. `guide` is set for identifiers that need it, else None. `budget`
+    limits the work of all sightings of a batch together.
     """
 
     direction: Vector
@@ -80,7 +78,7 @@ class Sighting(Struct, frozen=True, eq=False, gc=False):
 
 
 class SightingColumns(NamedTuple):
-    """Many sightings of one mission, one after another: k with m stars in all.
+    """The stars of k sightings of one mission as columns, with m stars in all.
 
     | column | shape | |
     |---|---|---|
@@ -111,15 +109,15 @@ class SightingColumns(NamedTuple):
     left: Any
 
     def set_region(self, s: int, region: SearchRegion) -> None:
-        """Fill in the region of a sighting; how it lies in its zone is filled in by `set_zone`."""
+        """Set the search region of a sighting; its relation to a zone is set by `set_zone`."""
         self.axis[s], self.is_band[s] = region.axis, region.kind == "band"
         self.least[s] = math.radians(region.least_deg)
         self.most[s] = math.radians(region.most_deg)
 
     def set_zone(self, s: int, region: SearchRegion, zone: Zone) -> None:
-        """Fill in how the region of a sighting lies in the zone that serves it."""
+        """Set the relation of a sighting's region to the zone that serves it."""
         self.all_inside[s] = zone.serves_exactly(region)
-        # Angles to the axis are kept in bands alone.
+        # Only bands store angles to the axis.
         if self.is_band[s] and not self.all_inside[s]:
             self.off_axis[s] = math.radians(separation_deg(zone.region.axis, region.axis))
 
@@ -127,7 +125,7 @@ class SightingColumns(NamedTuple):
 def room_for_sightings(
     offsets: Integers, sigma_rad: Vector, magnitude_mag: Vector
 ) -> SightingColumns:
-    """Columns for the sightings of these stars; what is not given is to be filled in."""
+    """Columns for sightings of given stars; all other values are to be filled in."""
     k, m = len(offsets) - 1, len(sigma_rad)
     boresight, velocity, prior_axis, axis = np.zeros((4, k, 3))
     least, most, off_axis = np.zeros((3, k))
@@ -142,7 +140,7 @@ def room_for_sightings(
 
 @njit(nogil=True)
 def sighted_at(columns, s):  # type: ignore[no-untyped-def]
-    """The stars of one of many sightings."""
+    """The stars of one sighting, from the columns of many."""
     first, last = columns.offsets[s], columns.offsets[s + 1]
     return SightedArrays(
         columns.direction[first:last],
@@ -157,7 +155,7 @@ def sighted_at(columns, s):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def bounds_at(columns, s):  # type: ignore[no-untyped-def]
-    """The region of one of many sightings."""
+    """The search region of one sighting, from the columns of many."""
     return RegionBounds(
         columns.axis[s],
         columns.least[s],

@@ -1,1 +1,1 @@
-"""The attitude and the lens of a picture of which neither is known."""
+"""Blind solver: attitude and lens of a picture without any prior knowledge."""

@@ -17,17 +17,17 @@ from scipy.spatial import cKDTree
 from service.vectors import Matrix, Projection, Vector, rotate_about
 
 BEND_PRIOR = 0.04
-"""One standard deviation of the radial displacement at the corner, as a share of the radius."""
+"""Prior sigma of the radial distortion at the corner, as a share of the radius."""
 CENTER_PRIOR = 0.03
-"""One standard deviation of the optical axis from the middle, as a share of the half diagonal."""
+"""Prior sigma of the optical axis' distance from the middle, as a share of the half diagonal."""
 FREE_SCALE, SCALE_BEND, SCALE_CENTER = 4, 5, 7
-"""Parameters fitted: rotation and focal length; with the distortion; with the centre too."""
+"""Numbers of fitted parameters: rotation and focal length; with distortion; with centre too."""
 PARAMETERS = ("focal_px", "bend", "off_u", "off_v")
-"""Names of the parameters of a lens, in the order in which they are fitted."""
+"""Names of a lens's parameters, in the order of fitting."""
 _ROUNDS = 12
 _CONVERGED = 1e-8
 NEIGHBOURS = 3
-"""Neighbours whose residuals estimate the correlated error of a star."""
+"""Number of neighbours whose residuals estimate the correlated error of a star."""
 LEAST_RESIDUAL_PX = 0.05
 WIDEST_RAD = 2.1
 """No lens shows what is farther from its axis."""
@@ -95,12 +95,12 @@ class Lens:
 
     @property
     def radius_px(self) -> float:
-        """Half the diagonal."""
+        """Half the diagonal of the picture, in pixels."""
         return 0.5 * math.hypot(self.width_px, self.height_px)
 
     @property
     def center_px(self) -> tuple[float, float]:
-        """The point where the optical axis meets the sensor; the first pixel's centre is (0, 0)."""
+        """The pixel coordinates of the optical axis; the first pixel's centre is (0, 0)."""
         return (
             0.5 * (self.width_px - 1) + self.off_u * self.radius_px,
             0.5 * (self.height_px - 1) + self.off_v * self.radius_px,
@@ -114,7 +114,7 @@ class Lens:
         return np.stack([x * scale, y * scale], axis=-1)
 
     def directions(self, u_px: Vector, v_px: Vector) -> Vector:
-        """Unit vectors (n, 3): x to the right of the picture, y down, z the boresight."""
+        """Unit vectors (n, 3) of pixels: x to the right of the picture, y down, z the boresight."""
         plane = self.plane(u_px, v_px)
         if self.projection == "gnomonic":
             vectors = np.concatenate([plane, np.ones((*plane.shape[:-1], 1))], axis=-1)
@@ -139,7 +139,7 @@ class Lens:
         return np.asarray(body[:, :2] * _stretch_of(self.projection, body)[0][:, None])
 
     def places(self, directions: Vector) -> tuple[Vector, Vector]:
-        """Pixels of directions (n, 3); NaN for those behind or far outside the picture."""
+        """Pixel coordinates of directions (n, 3); NaN behind or far outside the picture."""
         least_cosine = 0.0 if self.projection == "gnomonic" else math.cos(WIDEST_RAD)
         with np.errstate(divide="ignore", invalid="ignore"):
             shown = directions[:, 2:] > least_cosine
@@ -158,12 +158,12 @@ class Lens:
 
 @dataclass(frozen=True)
 class LensFit:
-    """A lens with the attitude (3, 3), catalog to camera, and what is known of both.
+    """A fitted lens and attitude (3, 3), catalog to camera, with their covariance and residuals.
 
     `covariance` (p, p) is of the small rotation about the camera's axes in radians, of the
-    logarithm of the focal length and, as far as they were fitted, of the lens's bend,
-    off_u and off_v.  It holds for sigmas as given, times `residual_scale` where that is
-    above 1.  `residual_px` (n, 2): observed minus predicted place.
+    logarithm of the focal length and, if fitted, of the lens's bend, off_u and off_v. Where
+    `residual_scale` exceeds 1, the covariance is for sigmas enlarged by that factor. `residual_px`
+    (n, 2): observed minus predicted place.
     """
 
     lens: Lens
@@ -173,7 +173,7 @@ class LensFit:
 
     @property
     def parameters(self) -> int:
-        """How many were fitted."""
+        """The number of fitted parameters."""
         return len(self.covariance)
 
 
@@ -188,10 +188,10 @@ def fit_lens(
     focal_sigma: float = math.inf,
     weight: Vector | None = None,
 ) -> LensFit:
-    """The lens and attitude that put stars (n, 3) nearest to where they are seen.
+    """The lens and attitude that minimise the residuals of identified stars (n, 3).
 
-    Least squares from a start that is near, with the priors of distortion and centre;
-    `focal_sigma` is that of the logarithm of the start's focal length.
+    Least squares from an approximate start, with priors on distortion and centre; `focal_sigma` is
+    the prior sigma of the logarithm of the start's focal length.
     """
     names = PARAMETERS[: parameters - 3]
     start = np.array([0.0, *(getattr(lens, name) for name in names[1:])])
@@ -218,7 +218,7 @@ def fit_lens(
 
 
 def lens_of(lens: Lens, names: tuple[str, ...], free: Vector) -> Lens:
-    """A lens with other parameters: the first value is of the logarithm of the focal length."""
+    """A lens with new parameters; the first value is added to the logarithm of the focal length."""
     values = dict(zip(names[1:], free[1:].tolist(), strict=True))
     values["focal_px"] = lens.focal_px * math.exp(free[0])
     return replace(lens, **values)
@@ -239,9 +239,9 @@ def linearised(
     v_px: Vector,
     star: Vector,
 ) -> tuple[Vector, Matrix]:
-    """The residuals (2 n,) in pixels, and by how much each parameter takes them down (2 n, p).
+    """The residuals (2 n,) in pixels, and their decrease per unit of each parameter (2 n, p).
 
-    Parameters are the small rotation about the camera's axes, then those of `lens_of`.
+    Parameters are a small rotation about the camera's axes, then those of `lens_of`.
     """
     trial = lens_of(lens, names, free)
     body = star @ attitude.T
@@ -260,7 +260,7 @@ def linearised(
             [-stretch * y, stretch * x],
         ]
     columns = [trial.focal_px * np.array(each) for each in turns]
-    # In pixels of one focal length: else a longer one would make all residuals longer.
+    # In pixels of a fixed focal length: otherwise a longer one would enlarge all residuals.
     columns.append(trial.focal_px * plane.T)
     if len(names) > 1:
         center_u, center_v = trial.center_px
@@ -278,10 +278,10 @@ def linearised(
 def shared_variance_px2(
     u_px: Vector, v_px: Vector, residual_px: Vector, variance_px2: float
 ) -> float:
-    """The variance per axis, in square pixels, of errors that the stars (n) may share.
+    """The variance per axis, in square pixels, of position errors that neighbouring stars share.
 
-    The mean product of the residuals (n, 2) of neighbours, and beside it what so few stars
-    do not show: `variance_px2` of the residuals over the root of n.
+    The mean product of neighbours' residuals (n, 2), plus its sampling error: `variance_px2` of the
+    residuals over the root of n.
     """
     places = np.column_stack([u_px, v_px])
     _, near = cKDTree(places).query(places, k=min(NEIGHBOURS + 1, len(u_px)))
@@ -292,10 +292,10 @@ def shared_variance_px2(
 def simpler_fit(
     fit: LensFit, u_px: Vector, v_px: Vector, star: Vector, residual_px: Vector
 ) -> LensFit | None:
-    """The fit to stars (n, 3) without the lens's last parameters; None if it has a scale alone.
+    """Fit to stars (n, 3) without the lens's last parameters; None if only the scale was fitted.
 
-    How far its attitude lies from that of the whole fit tells how much the terms of the lens
-    matter; those that are in no fit are not taken to matter less.
+    The difference of its attitude from that of the full fit shows the influence of the lens model;
+    terms that neither fit includes may matter as much.
     """
     if fit.parameters == FREE_SCALE:
         return None

@@ -1,8 +1,8 @@
-"""The blind solver: from places on a picture to the attitude, the focal length and the lens.
+"""The blind solver: attitude, focal length and lens from the places of stars on a picture.
 
-Patterns of four points are looked up by their shape, which neither rotation nor scale
-changes; each hit is an attitude with a focal length, which is then verified by the
-stars that should be elsewhere on the picture.
+Patterns of four points are looked up by their shape, which neither rotation nor scale changes; each
+hit gives an attitude and a focal length, which are then verified with the other stars that the
+picture should show.
 """
 
 import math
@@ -30,50 +30,50 @@ Sets = npt.NDArray[np.int64]
 
 ACCEPT_LOG_ODDS = 14.0
 SURE_LOG_ODDS = 30.0
-"""The search ends at once."""
+"""Log odds of a solution at which the search ends at once."""
 STAGES = ((8, 0.02), (12, 0.02), (16, 0.025), (10, 0.05), (22, 0.025))
-"""For each stage: the number of likeliest points that make patterns, and the tolerance of codes."""
+"""Stages of the search: the number of likely points for patterns, and the tolerance of codes."""
 NARROW_TAN = 0.25
-"""Half diagonals up to this are looked at as if of one focal length: patterns keep their shape."""
+"""Largest ratio of half diagonal to focal length for which one trial focal length suffices."""
 WIDE_STEP = 1.3
-"""Between the focal lengths of wider fields."""
+"""Ratio of successive trial focal lengths for wider fields."""
 VERIFIED_POINTS = 40
 COARSE_POINTS = 24
 COARSE_GATE = 0.02
 """Tolerance of a match before the lens is fitted, as a share of the half diagonal."""
 LIKELY_CHANCE = 0.1
-"""Matches beside the pattern that chance gives more often than this are not looked at further."""
+"""Largest probability that chance explains the additional matches of a hit worth verifying."""
 MOST_HITS = 20_000
-"""Some half a second of work; random points give a tenth of this."""
+"""Largest number of pattern hits: about half a second of work; random points give a tenth."""
 WIDEST_FIELD_DEG = (3.0, 70.0)
 
 
 @dataclass(frozen=True)
 class FocalRange:
-    """The focal lengths to look for, in pixels."""
+    """A range of focal lengths to search, in pixels."""
 
     least_px: float
     most_px: float
 
     @property
     def log_width(self) -> float:
-        """The width in logarithms, of a range that is not of one value."""
+        """The width of the range in logarithms, with a lower bound."""
         return max(math.log(self.most_px / self.least_px), 0.01)
 
     @classmethod
     def about(cls, focal_px: float, share: float) -> "FocalRange":
-        """What is within a share of a focal length."""
+        """The range within a relative error of a focal length."""
         return cls(focal_px / (1.0 + share), focal_px * (1.0 + share))
 
     @classmethod
     def of_fields(cls, side_px: int, field_deg: tuple[float, float]) -> "FocalRange":
-        """The focal lengths that belong to a range of fields of view along a side."""
+        """The range of focal lengths for a range of fields of view along a side."""
         least, most = (focal_px_of(side_px, deg) for deg in field_deg[::-1])
         return cls(least, most)
 
 
 def focal_px_of(side_px: int, field_deg: float, projection: Projection = "gnomonic") -> float:
-    """The focal length with which a side spans a field of view."""
+    """The focal length in pixels at which a side spans a field of view."""
     return 0.5 * side_px / distance_of(projection, math.radians(0.5 * field_deg))
 
 
@@ -83,11 +83,11 @@ def least_log_odds(trials: int) -> float:
 
 
 class BlindResult(NamedTuple):
-    """What a search came to: `found` is None where no evidence was enough.
+    """The result of a blind search: `found` is None where no evidence sufficed.
 
-    `best_log_odds` is of the best that was looked at, also of one refused; `patterns` were
-    looked up, `hits` agreed in shape, `verified` also in stars elsewhere.  `bounded`: the
-    search ended at the most work allowed.
+    `best_log_odds` is that of the best hypothesis, also of a refused one. `patterns`, `hits` and
+    `verified` count the patterns looked up, those that agreed in shape, and those confirmed by
+    other stars. `bounded`: the search ended at its limit of work.
     """
 
     found: Verified | None
@@ -100,7 +100,7 @@ class BlindResult(NamedTuple):
 
 @dataclass
 class BlindSolver:
-    """The patterns of a catalog's brightest stars (n, 3), built when they are first looked for."""
+    """A blind solver with the star patterns of a catalog (n, 3), built at their first use."""
 
     direction: Vector
     stars: Stars = field(init=False)
@@ -111,11 +111,11 @@ class BlindSolver:
 
     @property
     def nbytes(self) -> int:
-        """Bytes held once all levels are built."""
+        """Estimated size in bytes once all pattern levels are built."""
         return 10 * self.direction.nbytes + 90_000_000
 
     def level(self, radius_deg: float) -> QuadLevel:
-        """The patterns of one scale."""
+        """The star patterns of one angular size."""
         if radius_deg not in self._levels:
             self._levels[radius_deg] = build_quad_level(self.direction, radius_deg)
         return self._levels[radius_deg]
@@ -145,7 +145,7 @@ class BlindSolver:
         )
 
     def refined(self, found: Verified, points: Points, focal: FocalRange) -> Verified:
-        """The same with more points: all that match, and the lens fitted to them."""
+        """A verified solution refitted to more points, where that keeps most of the matches."""
         gate_px = max(5.0 * found.rms_px, 2.0)
         again = refine(points, self.stars, found, focal.log_width, gate_px)
         return again if again is not None and again.matched >= 0.9 * found.matched else found
@@ -153,7 +153,7 @@ class BlindSolver:
 
 @dataclass
 class _Search:
-    """One search, and how much work it was."""
+    """The state of one blind search, with counts of the work done."""
 
     solver: BlindSolver
     points: Points
@@ -167,12 +167,12 @@ class _Search:
         self.many = self.points.first(VERIFIED_POINTS)
 
     def hypotheses(self) -> Iterator[tuple[Matrix, Lens]]:
-        """Attitudes with focal lengths that patterns of four points agree with."""
+        """Attitudes and lenses at which a pattern of four points matches one of the catalog."""
         done: list[tuple[int, float]] = []
         for most, tolerance in STAGES:
             count = min(most, len(self.points))
             sets = _sets_of_four(count)
-            # Not again what an earlier stage of no less tolerance looked up.
+            # Skip patterns that an earlier stage looked up with at least this tolerance.
             sets = sets[sets[:, 3] >= max((n for n, t in done if t >= tolerance), default=0)]
             done.append((count, tolerance))
             if len(sets):
@@ -187,7 +187,7 @@ class _Search:
         quads = np.take_along_axis(sets, order, axis=1)
         for radius_deg in LEVELS_DEG:
             narrow, wide = (share * math.radians(radius_deg) for share in (LEAST_WIDTH, 2.0))
-            # The longer the focal length, the narrower a pattern that is seen so wide.
+            # The longer the focal length, the smaller the angle of a pattern on the picture.
             fits = (chord * lens.focal_px < wide * most_px) & (
                 chord * lens.focal_px > narrow * least_px
             )
@@ -210,7 +210,7 @@ class _Search:
                     yield rotation_between(body, sky[level.stars[row]]), at
 
     def verified_at(self, attitude: Matrix, lens: Lens) -> Verified | None:
-        """The evidence of a hit; None where too few stars stand where it has them."""
+        """The verified solution of a hit; None where too few other stars match."""
         few, stars = self.few, self.solver.stars
         gate_px = COARSE_GATE * lens.radius_px
         _, u, v = stars.near(attitude, lens, 2 * len(few))
@@ -226,7 +226,7 @@ class _Search:
 
 
 def _guesses(points: Points, focal: FocalRange) -> list[tuple[Lens, float, float]]:
-    """Lenses to look through, each with the least and most focal length that it stands for."""
+    """Trial lenses, each with the range of focal lengths that it represents."""
     radius = 0.5 * math.hypot(points.width_px, points.height_px)
     narrow_px = radius / NARROW_TAN
     guesses = []
@@ -243,19 +243,19 @@ def _guesses(points: Points, focal: FocalRange) -> list[tuple[Lens, float, float
 
 @cache
 def _sets_of_four(count: int) -> Sets:
-    """All sets of four of so many, those of the first ones first."""
+    """All sets of four out of `count` points, those of the most likely points first."""
     sets = np.array(list(combinations(range(count), 4)), dtype=np.int64).reshape(-1, 4)
     return sets[np.argsort(sets[:, 3], kind="stable")]
 
 
 def rotation_between(body: Vector, sky: Vector) -> Matrix:
-    """The rotation (3, 3) that best turns directions `sky` (n, 3) into `body`."""
+    """The rotation (3, 3) that best turns directions `sky` (n, 3) into `body` (n, 3)."""
     u, _, vt = np.linalg.svd(body.T @ sky)
     return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
 
 
 def _chance_of(count: int, mean: float) -> float:
-    """The chance of at least so many where a mean is expected, after Poisson."""
+    """The Poisson probability of at least `count` events for a given mean."""
     term, below = math.exp(-mean), 0.0
     for k in range(count):
         below += term

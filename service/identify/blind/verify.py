@@ -1,4 +1,4 @@
-"""The evidence for an attitude and a lens: catalog stars that stand where the two predict them."""
+"""Evidence for an attitude and a lens: catalog stars that match a picture's points."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -24,26 +24,26 @@ Rows = npt.NDArray[np.int64]
 
 GATE_SIGMAS = 3.5
 LEAST_SIGMA_PX = 0.15
-"""No place is taken as better known than this before the residuals have spoken."""
+"""Least position sigma in pixels, before residuals show the actual errors."""
 FAINTEST_SHARE = 2.5
-"""Catalog stars looked for, for every point: clutter and gaps move the limits apart."""
+"""Number of catalog stars tried per point: clutter and gaps shift the limiting magnitude."""
 LEAST_STARS, MOST_STARS = 12, 400
 MODELS = (FREE_SCALE, SCALE_BEND, SCALE_CENTER)
 FIRST_MODEL = 3
-"""The round from which models are fitted; those before it look for matches."""
+"""Round from which lens models are fitted; earlier rounds collect matches."""
 LEAST_MATCHES = {FREE_SCALE: 4, SCALE_BEND: 7, SCALE_CENTER: 12}
-"""Matches from which a model is fitted; of those that are, the evidence chooses."""
+"""Least number of matches for each lens model; among those allowed the evidence decides."""
 HOPELESS_LOG_ODDS = 0.0
-"""Below this after two rounds: what is true stands above 20 by then, and chance below -5."""
+"""Log odds after two rounds below which a hypothesis is dropped; chance stays below -5."""
 CROWD = 6
-"""The nearest other points by which it is told how crowded a place is."""
+"""Number of nearest points that measure the crowding of a place."""
 LEAST_REFINED = {FREE_SCALE: 4, SCALE_BEND: 6, SCALE_CENTER: 8}
-"""The same once the attitude is known: priors hold what the stars do not."""
+"""Least number of matches for each lens model once the attitude is known."""
 
 
 @dataclass(frozen=True)
 class Points:
-    """The candidates of a picture (n), the likeliest star first: places and sigmas in pixels."""
+    """The points of a picture (n), the most likely stars first: places and sigmas in pixels."""
 
     u_px: Vector
     v_px: Vector
@@ -56,17 +56,17 @@ class Points:
 
     @cached_property
     def crowding(self) -> Vector:
-        """By how much denser than on the whole picture other points are about each (n), at least 1.
+        """Local density of other points about each point (n), over the mean density; at least 1.
 
-        Clutter gathers in corners and along horizons.  Taken as spread over the picture it
-        would be a wonder that a cluster of stars explains it.
+        Clutter gathers in corners and along horizons. If clutter were assumed uniform, a cluster of
+        stars that matches such clutter would look significant.
         """
         others = len(self) - 1
         if others < 2:
             return np.ones(len(self))
         places = np.column_stack([self.u_px, self.v_px])
         near = min(CROWD, others)
-        # Squares about the points, whose parts on the picture are known exactly.
+        # Squares about the points, since their overlap with the picture is exact.
         reach = cKDTree(places).query(places, k=near + 1, p=math.inf)[0][:, -1:]
         size = np.array([self.width_px, self.height_px], dtype=np.float64)
         sides = np.minimum(places + reach, size - 0.5) - np.maximum(places - reach, -0.5)
@@ -74,7 +74,7 @@ class Points:
         return np.asarray(np.maximum((near - 1) / others / share, 1.0))
 
     def first(self, count: int) -> "Points":
-        """The likeliest so many."""
+        """The first `count` points, which are the most likely stars."""
         return replace(
             self,
             u_px=self.u_px[:count],
@@ -85,16 +85,16 @@ class Points:
 
 @dataclass(eq=False)
 class Stars:
-    """The catalog (n, 3), brightest first, with trees of its directions."""
+    """The catalog stars (n, 3), brightest first, with search trees of their directions."""
 
     direction: Vector
     _trees: dict[int, cKDTree] = field(default_factory=dict)
 
     def _brightest(self, toward: Vector, reach: float, most: int) -> Rows:
-        """The brightest so many within an angle of a direction, or all that there are.
+        """The rows of the brightest `most` stars within an angle of a direction.
 
-        Looked for among as many stars of the sky as have so many there, and among more if
-        that corner of the sky is empty.
+        The search uses as many of the sky's brightest stars as have that number there on average,
+        and more if that part of the sky is empty.
         """
         count = 2.0 * most / (0.5 * (1.0 - math.cos(reach)))
         while True:
@@ -107,9 +107,9 @@ class Stars:
             count = 2.0 ** (power + 1)
 
     def near(self, attitude: Matrix, lens: Lens, most: int) -> tuple[Rows, Vector, Vector]:
-        """The brightest so many on a picture: rows, and where they stand (n)."""
+        """Brightest `most` stars on a picture: catalog rows, and their pixel coordinates (n)."""
         reach = lens.reach_rad + 0.002
-        # Before their places are known: a picture holds most of the cap about it.
+        # Preselection before projection: the picture fills most of the cap about it.
         rows = self._brightest(attitude[2], reach, 3 * most)
         u, v = lens.places(self.direction[rows] @ attitude.T)
         with np.errstate(invalid="ignore"):
@@ -120,11 +120,11 @@ class Stars:
 
 @dataclass(frozen=True)
 class Verified:
-    """An attitude with its lens, the star of every point (-1: none), and what it weighs.
+    """A verified attitude with its lens, the star of every point (-1: none), and the evidence.
 
-    `log_odds` is the evidence against the points being clutter, everywhere and at every
-    scale that was to be expected.  `residual_px` (m, 2) of the matched points: seen minus
-    predicted; `rms_px` is theirs per axis, the freedom of the fit allowed for.
+    `log_odds` is the evidence against all points being clutter, integrated over all attitudes and
+    expected scales. `residual_px` (m, 2) of the matched points is observed minus predicted;
+    `rms_px` per axis accounts for the fitted parameters.
     """
 
     fit: LensFit
@@ -135,7 +135,7 @@ class Verified:
 
     @property
     def matched(self) -> int:
-        """How many points have a star."""
+        """The number of points matched with a star."""
         return int((self.star >= 0).sum())
 
 
@@ -147,14 +147,14 @@ def verify(
     log_focal_range: float,
     gate_px: float,
 ) -> Verified | None:
-    """The attitude and lens refined from what they match; None where they match too little."""
+    """Attitude and lens refined by rounds of matching and fitting; None with too few matches."""
     sigma = np.maximum(points.sigma_px, LEAST_SIGMA_PX)
     best = None
     for number, parameters in enumerate((*[0] * FIRST_MODEL, *MODELS)):
         if number == 2 and (best is None or best.log_odds < HOPELESS_LOG_ODDS):
             return best
         if number <= FIRST_MODEL:
-            # All models are fitted to what the last round matched.
+            # All models are fitted to the matches of the last search round.
             rows, at, seen = _matches(points, stars, attitude, lens, gate_px)
         if len(seen) < LEAST_MATCHES[parameters or FREE_SCALE]:
             return best
@@ -164,7 +164,8 @@ def verify(
         if found is not None and (best is None or found.log_odds > best.log_odds):
             best = found
         if not parameters:
-            # Towards the matches that the next round is to find; the models start from the last.
+            # Each search round starts from the fit before it; all models start from the last search
+            # round.
             attitude, lens = fit.attitude, fit.lens
             gate_px = min(gate_px, max(GATE_SIGMAS * scale * float(np.median(sigma[seen])), 0.8))
     return best
@@ -173,9 +174,10 @@ def verify(
 def refine(
     points: Points, stars: Stars, found: Verified, log_focal_range: float, gate_px: float
 ) -> Verified | None:
-    """What was verified with more points, and with every parameter of the lens that they allow.
+    """A verified solution refitted to more points, with all lens parameters that they allow.
 
-    What the evidence did not ask for is fitted too: the sigmas then know of it.
+    Parameters that the evidence does not favour are fitted too, so that the sigmas include their
+    uncertainty.
     """
     sigma = np.maximum(points.sigma_px, LEAST_SIGMA_PX)
     attitude, lens, refined = found.fit.attitude, found.fit.lens, None
@@ -205,7 +207,7 @@ def _refit(
     sigma: Vector,
     parameters: int,
 ) -> LensFit:
-    """The lens of a model, or of that with the distortion where the matches allow it."""
+    """The fit of a lens model to matches; without a model, with distortion if the matches allow."""
     if not parameters:
         parameters = SCALE_BEND if len(seen) >= LEAST_MATCHES[SCALE_BEND] else FREE_SCALE
     start = replace(lens, off_u=0.0, off_v=0.0, bend=lens.bend if parameters > FREE_SCALE else 0.0)
@@ -222,9 +224,9 @@ def _refit(
 
 
 def _scale(fit: LensFit, sigma: Vector) -> float:
-    """How much longer the residuals are than their sigmas, at least 1, by their median."""
+    """The ratio of residuals to their sigmas, by the median, at least 1."""
     pull = np.abs(fit.residual_px) / sigma[:, None]
-    # Of few stars the fit takes a part of the residuals away.
+    # With few stars the fit absorbs a part of the residuals.
     freedom = max(pull.size - fit.parameters, 1) / pull.size
     return max(float(np.median(pull)) / 0.674 / math.sqrt(freedom), 1.0)
 
@@ -238,7 +240,7 @@ def _weights(
     seen: Rows,
     sigma: Vector,
 ) -> Vector:
-    """Those of Cauchy about the median: a wrong match pulls little."""
+    """Cauchy weights about the median residual, so that wrong matches have little influence."""
     u, v = lens.places(stars.direction[rows] @ attitude.T)
     off = np.hypot(points.u_px[seen] - u, points.v_px[seen] - v)
     usual = max(2.0 * float(np.median(off)), float(np.median(sigma[seen])))
@@ -248,7 +250,7 @@ def _weights(
 def _matches(
     points: Points, stars: Stars, attitude: Matrix, lens: Lens, gate_px: float
 ) -> tuple[Rows, Rows, Rows]:
-    """Catalog rows on the picture, and of every match its place among them and its point."""
+    """Catalog rows on the picture, and for every match the index of its row and of its point."""
     most = int(np.clip(FAINTEST_SHARE * len(points), LEAST_STARS, MOST_STARS))
     rows, u, v = stars.near(attitude, lens, most)
     if len(rows) == 0:
@@ -259,7 +261,7 @@ def _matches(
 
 
 def matched(points: Points, u_px: Vector, v_px: Vector, gate_px: float) -> tuple[Rows, Rows]:
-    """Stars and points that are each other's nearest, within a gate."""
+    """Pairs of stars and points that are mutual nearest neighbours, within a gate."""
     apart = (points.u_px[:, None] - u_px) ** 2 + (points.v_px[:, None] - v_px) ** 2
     star_of, point_of = apart.argmin(axis=1), apart.argmin(axis=0)
     rows = np.arange(len(star_of))
@@ -270,7 +272,7 @@ def matched(points: Points, u_px: Vector, v_px: Vector, gate_px: float) -> tuple
 def _weighed(
     points: Points, stars: Stars, fit: LensFit, sigma: Vector, log_focal_range: float
 ) -> Verified | None:
-    """The evidence of a fit, by Laplace's approximation over its parameters."""
+    """The solution of a fit with its evidence, by Laplace's approximation over the parameters."""
     lens = fit.lens
     gate_px = GATE_SIGMAS * float(np.median(sigma))
     rows, at, seen = _matches(points, stars, fit.attitude, lens, max(gate_px, 0.8))
@@ -280,7 +282,7 @@ def _weighed(
     residual = np.column_stack([points.u_px[seen] - u, points.v_px[seen] - v])
     off2 = (residual**2).sum(axis=1)
     variance = sigma[seen] ** 2
-    # As deep as the faintest match but for a few: fainter ones cost more.
+    # The depth is that of the faintest match but for a few; deeper matches cost more evidence.
     depth = float(np.sort(at)[-1 - len(at) // 10]) + 1.0
     expected = np.maximum(at + 1.0, depth)
     share = len(seen) / (len(points) + 1.0)
@@ -289,7 +291,7 @@ def _weighed(
     gain /= points.crowding[seen]
     weight = float(np.log(1.0 - share + share * gain).sum())
     weight += (len(points) - len(seen)) * math.log(1.0 - share)
-    # The covariance is for sigmas as told; what they turned out to be widens it.
+    # The covariance is for the assumed sigmas; the observed scatter enlarges them.
     covariance = (
         fit.covariance * float(np.median(sigma / np.maximum(points.sigma_px, LEAST_SIGMA_PX))) ** 2
     )

@@ -1,1 +1,1 @@
-"""Identification by weighing hypotheses: the identifier `verified`."""
+"""Star identification by the posterior of hypotheses: the identifier `verified`."""

@@ -1,4 +1,4 @@
-"""How much a hypothesis explains: its weight as a posterior, up to a common constant.
+"""The posterior weight of an identification hypothesis, up to a common constant.
 
 A hypothesis names a catalog star, or clutter, for every observed star.  Its
 attitude is integrated out by Laplace's approximation, the noise of positions
@@ -26,21 +26,25 @@ from service.identify.sighting import PRIOR_DIRECTION, PRIOR_ROTATION
 
 CLUTTER_SPAN_MAG = 6.0
 POSITION_SCALES = np.array([1.0, 2.0, 4.0, 8.0, 16.0])
-"""In units of the tracker's sigma: 2 to 34 arcsec for the shipped trackers."""
+"""Factors on the tracker's sigma that are averaged over: 2 to 34 arcsec for the shipped
+trackers.
+"""
 MAGNITUDE_SCALES_MAG = np.array([0.1, 0.2, 0.4, 0.8, 1.6, 3.2])
 OFFSET_SIGMA_MAG = 0.5
-"""A constant offset of the observed magnitudes is none at all or normal with this sigma."""
+"""Prior sigma of a common offset of the observed magnitudes, if there is one."""
 BETA_CLUTTER, BETA_STAR = 0.5, 4.5
 TWO_STARS_BONUS, TWO_STARS_PER_SQUARE, TWO_STARS_SIGMA_MAG = 0.5, 0.25, 0.35
-"""Two stars alone, which chance often puts anywhere, are held closer to the sigma that is told.
+"""Bonus and penalties for hypotheses of only two stars, which chance often matches.
 
-Of two random points the wide scales of noise let 20 in 50,000 pass for stars, with these seven do,
-while as many real pairs pass as before.
+With wide noise scales alone, 20 of 50,000 pairs of random points pass for stars; with these
+penalties seven do, while as many real pairs pass.
 """
 TWO_OF_MANY = -2.0
-"""Added where other stars stay unexplained: of many random points some two agree with a pair."""
+"""Penalty of two-star hypotheses beside unexplained stars, where chance pairs are frequent."""
 ROTATION_SCALES_DEG = np.array([0.05, 0.3, 2.0, 10.0, 45.0])
-"""Heavy tails: the a priori attitude is off by a normal deviate of one of these, all alike."""
+"""Scales in degrees of a heavy-tailed prior for the a priori attitude's error, with equal
+weights.
+"""
 TILT_SCALES_DEG = np.array([0.05, 0.2, 1.0, 4.0, 15.0])
 
 _LOG_2PI = math.log(2.0 * math.pi)
@@ -49,14 +53,14 @@ _LOG_POSITION_SCALES = np.log(POSITION_SCALES)
 _LOG_MAGNITUDE_SCALES = np.log(MAGNITUDE_SCALES_MAG)
 _FEW = 32
 _LOG_JOINT = np.log(MAGNITUDE_SCALES_MAG**2 + np.arange(_FEW + 1)[:, None] * OFFSET_SIGMA_MAG**2)
-"""For up to so many stars the logarithm of t^2 + count sigma^2, worked out once."""
+"""Table of log(t^2 + count sigma^2) for up to `_FEW` stars."""
 _LOG_BETA_OF_NONE = (
     math.lgamma(BETA_CLUTTER) + math.lgamma(BETA_STAR) - math.lgamma(BETA_CLUTTER + BETA_STAR)
 )
 
 
 def _table_of_clutter() -> npt.NDArray[np.float64]:
-    """Log probability of so much clutter and so many stars, for few of both."""
+    """A table of log probabilities for small numbers of clutter points and stars."""
     table = np.empty((_FEW + 1, _FEW + 1))
     for clutter in range(_FEW + 1):
         for stars in range(_FEW + 1):
@@ -71,20 +75,20 @@ _LOG_CLUTTER = _table_of_clutter()
 
 @njit_no_refcount
 def log_sum(a, b):  # type: ignore[no-untyped-def]
-    """ln(e^a + e^b)."""
+    """The logarithm of a sum, ln(e^a + e^b)."""
     top = max(a, b)
     return top if top == -math.inf else top + math.log(math.exp(a - top) + math.exp(b - top))
 
 
 @njit_no_refcount
 def log_beta(a, b):  # type: ignore[no-untyped-def]
-    """Logarithm of Euler's beta function."""
+    """The logarithm of Euler's beta function."""
     return math.lgamma(a) + math.lgamma(b) - math.lgamma(a + b)
 
 
 @njit_no_refcount
 def log_clutter(clutter, stars):  # type: ignore[no-untyped-def]
-    """Log probability that just these are clutter."""
+    """Log probability of a particular choice of clutter points among the observed stars."""
     if clutter <= _FEW and stars <= _FEW:
         return _LOG_CLUTTER[clutter, stars]
     return log_beta(clutter + BETA_CLUTTER, stars + BETA_STAR) - _LOG_BETA_OF_NONE
@@ -92,10 +96,10 @@ def log_clutter(clutter, stars):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def log_prior(angle, kind):  # type: ignore[no-untyped-def]
-    """Log density of an attitude, per cubed radian of rotation, at an angle from the presumed one.
+    """Log prior density of an attitude per cubed radian, at an angle from the presumed attitude.
 
-    The angle is the total rotation or, where only an axis is known
-    (`PRIOR_DIRECTION`), the tilt of that axis, any roll alike.
+    For `PRIOR_DIRECTION`, where only an axis is known, the angle is the tilt of that axis, and any
+    roll is equally likely.
     """
     if kind == PRIOR_ROTATION:
         density = 1.0 / (8.0 * math.pi * math.pi)
@@ -112,10 +116,10 @@ def log_prior(angle, kind):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def log_prior_on_circle(off, radius):  # type: ignore[no-untyped-def]
-    """Log density of an attitude, per cubed radian, of which one axis lies near a circle.
+    """Log prior density of an attitude per cubed radian if one axis lies near a circle on the sky.
 
-    `off` is that axis' distance from the circle of that `radius`; any place along it
-    and any roll are alike.  A circle narrower than a scale of the tilts is a point.
+    `off` is the axis' distance from the circle of the given `radius`; positions along the circle
+    and rolls are equally likely. A circle narrower than a scale of the tilts counts as a point.
     """
     density = 1.0 / (4.0 * math.pi)
     for scale_deg in TILT_SCALES_DEG:
@@ -125,16 +129,16 @@ def log_prior_on_circle(off, radius):  # type: ignore[no-untyped-def]
     return math.log(density / (len(TILT_SCALES_DEG) + 1) / (2.0 * math.pi))
 
 
-# Tables are filled by the plain functions, so that an import compiles nothing.
+# Tables are filled with the uncompiled functions, so that an import compiles nothing.
 LOG_PRIOR_AT_BEST = np.array(
     [log_prior.py_func(0.0, kind) for kind in (PRIOR_ROTATION, PRIOR_DIRECTION)]
 )
-"""The largest log density of an attitude, by the kind of prior."""
+"""The largest log prior density of an attitude, by the kind of prior."""
 
 
 @njit_no_refcount
 def log_positions(stars, square, log_det, reference_sigma_rad):  # type: ignore[no-untyped-def]
-    """The attitude and the positions: Laplace's integral, averaged over the scales of noise."""
+    """Log evidence of the positions, with the attitude integrated out and noise scales averaged."""
     largest = -math.inf
     total = 0.0
     log_reference = math.log(reference_sigma_rad)
@@ -151,12 +155,14 @@ def log_positions(stars, square, log_det, reference_sigma_rad):  # type: ignore[
 
 
 _LOG_EXACT = np.array([log_positions.py_func(count, 0.0, 0.0, 1.0) for count in range(_FEW + 1)])
-"""By the number of stars, for a sigma of one radian; another adds a multiple of its logarithm."""
+"""Table of position evidence without residuals, by number of stars, for a sigma of one radian; for
+another sigma a multiple of its logarithm is added.
+"""
 
 
 @njit_no_refcount
 def log_exact_positions(stars, reference_sigma_rad):  # type: ignore[no-untyped-def]
-    """The attitude and the positions without residuals and det N: the most they weigh."""
+    """An upper bound on the position evidence: no residuals, and det N left out."""
     if stars <= _FEW:
         return _LOG_EXACT[stars] + (3 - 2 * stars) * math.log(reference_sigma_rad)
     return log_positions(stars, 0.0, 0.0, reference_sigma_rad)
@@ -164,7 +170,9 @@ def log_exact_positions(stars, reference_sigma_rad):  # type: ignore[no-untyped-
 
 @njit_no_refcount
 def log_magnitudes(count, total_mag, square_mag2):  # type: ignore[no-untyped-def]
-    """The magnitudes of `count` stars: sum and sum of squares of observed minus catalog."""
+    """Log evidence of `count` magnitudes, from the sum and sum of squares of observed minus
+    catalog.
+    """
     if count == 0:
         return 0.0
     largest = -math.inf
@@ -190,16 +198,16 @@ _LOG_EQUAL = np.array([log_magnitudes.py_func(count, 0.0, 0.0) for count in rang
 
 @njit_no_refcount
 def log_equal_magnitudes(count):  # type: ignore[no-untyped-def]
-    """The magnitudes of `count` stars that are all as the catalog has them: the most they weigh."""
+    """Upper bound on the magnitude evidence: all `count` magnitudes equal those of the catalog."""
     return _LOG_EQUAL[count] if count <= _FEW else log_magnitudes(count, 0.0, 0.0)
 
 
 @njit_no_refcount
 def log_of_two(square, compared, square_mag2, reference_sigma_rad, clutter):  # type: ignore[no-untyped-def]
-    """What is added to the weight of two stars alone: see `TWO_STARS_BONUS`.
+    """The additional log weight of a hypothesis of only two stars; see `TWO_STARS_BONUS`.
 
-    `square` is the weighted sum of squared residuals, `square_mag2` that of the
-    differences of `compared` magnitudes; so many other stars are `clutter`.
+    `square` is the weighted sum of squared residuals, `square_mag2` that of the differences of
+    `compared` magnitudes; `clutter` is the number of other stars.
     """
     bonus = TWO_STARS_BONUS if compared == 2 else 0.0
     if clutter > 0:
@@ -211,10 +219,10 @@ def log_of_two(square, compared, square_mag2, reference_sigma_rad, clutter):  # 
 
 @njit_no_refcount
 def log_null(count, with_magnitude):  # type: ignore[no-untyped-def]
-    """The rival that always stands in the denominator: no real star at all, or a single one.
+    """The log weight of the null hypothesis: no real star at all, or a single one.
 
-    A single real star may be any of the zone's, whose number cancels its
-    density; its magnitude is taken as spread like clutter's.
+    A single real star may be any star of the zone, whose number cancels the density; the spread of
+    its magnitude is assumed to be that of clutter.
     """
     none = log_clutter(count, 0)
     one = log_clutter(count - 1, 1) + math.log(count)

@@ -1,4 +1,4 @@
-"""Fitting a hypothesis and weighing it.
+"""The fit of a hypothesis' attitude, and its posterior weight.
 
 A hypothesis is `match` (n,): for every observed star the row of a zone star,
 -1 for clutter.
@@ -17,12 +17,12 @@ from service.identify.sighting import PRIOR_ROTATION
 from service.sky.geometry.directions import separation_rad
 
 LEAST_SINE2 = 4e-10
-"""Least value of four times the squared sine of the angle between the widest pair: 2 arcsec."""
+"""Least value of four times the squared sine of the widest pair's angle, for 2 arcsec."""
 
 
 @njit_inlined
 def fit_match(observed, stars, match, scratch, steps):  # type: ignore[no-untyped-def]
-    """Fit T to a hypothesis: TRIAD on the widest pair, then Gauss-Newton steps.
+    """Fit the attitude T of a hypothesis: TRIAD on the widest pair, then Gauss-Newton steps.
 
     Returns the number of stars, the weighted sum of squared residuals and
     ln det N; the number is 0 where the geometry gives no attitude.
@@ -53,7 +53,7 @@ def fit_match(observed, stars, match, scratch, steps):  # type: ignore[no-untype
                 chord2 = 0.0
                 for i in range(3):
                     chord2 += (references[k, i] - references[other, i]) ** 2
-                # Four times the squared sine: near zero and near a half turn alike.
+                # Four times the squared sine is small both near zero and near a half turn.
                 apart = chord2 * (4.0 - chord2)
                 if apart > widest:
                     widest, first, second = apart, k, other
@@ -100,7 +100,7 @@ def fit_match(observed, stars, match, scratch, steps):  # type: ignore[no-untype
 
 @njit_no_refcount
 def work_of_fit(n, matched):  # type: ignore[no-untyped-def]
-    """What a fit of some of n stars counts as: all pairs are looked at for the widest."""
+    """The work units of a fit: all pairs of matched stars are compared to find the widest."""
     return n + n * matched // 100
 
 
@@ -116,7 +116,9 @@ def _determinant(m):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def turn(t, e0, e1, e2):  # type: ignore[no-untyped-def]
-    """T becomes exp(-[e x]) T, by the quaternion (e/2, 1) so that it stays orthonormal."""
+    """Rotate T in place to exp(-[e x]) T, by the quaternion (e/2, 1), which keeps it
+    orthonormal.
+    """
     norm = 1.0 / math.sqrt(1.0 + 0.25 * (e0 * e0 + e1 * e1 + e2 * e2))
     x, y, z, c = 0.5 * e0 * norm, 0.5 * e1 * norm, 0.5 * e2 * norm, norm
     for j in range(3):
@@ -134,7 +136,7 @@ def turn(t, e0, e1, e2):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def prior_angle(t, axis, kind):  # type: ignore[no-untyped-def]
-    """The angle that the prior weighs: T's total rotation, or the tilt that it gives the axis."""
+    """Angle that enters the attitude prior: T's total rotation, or the tilt of the known axis."""
     if kind == PRIOR_ROTATION:
         x, y, z = t[2, 1] - t[1, 2], t[0, 2] - t[2, 0], t[1, 0] - t[0, 1]
         return math.atan2(math.sqrt(x * x + y * y + z * z), t[0, 0] + t[1, 1] + t[2, 2] - 1.0)
@@ -147,7 +149,7 @@ def prior_angle(t, axis, kind):  # type: ignore[no-untyped-def]
 
 @njit_inlined
 def weigh(observed, stars, match, scratch):  # type: ignore[no-untyped-def]
-    """The log weight of a hypothesis, fitted; see `fit_match`."""
+    """The log posterior weight of a hypothesis after fitting; see `fit_match`."""
     count, square, log_det = fit_match(observed, stars, match, scratch, 1)
     if count < 2:
         return -math.inf
@@ -156,11 +158,10 @@ def weigh(observed, stars, match, scratch):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def weigh_without(observed, stars, match, k, square, scratch):  # type: ignore[no-untyped-def]
-    """The log weight of a hypothesis, already fitted in `scratch`, when star k of it is clutter.
+    """The log weight of a fitted hypothesis in `scratch` with star k changed to clutter.
 
-    The fit is linear within its residuals: what star k brought to N, to the
-    sum of squares and to the gradient, which is zero, is taken away again.
-    `match` has -1 for star k already.
+    The fit is linear within its residuals: the contributions of star k to N, to the sum of squares
+    and to the gradient, which is zero, are subtracted. `match` has -1 for star k already.
     """
     t, matrix, smaller, inverse, turned = (
         scratch.t,
@@ -203,7 +204,7 @@ def weigh_without(observed, stars, match, k, square, scratch):  # type: ignore[n
 
 @njit_inlined
 def log_weight_of(observed, stars, match, t, count, square, log_det):  # type: ignore[no-untyped-def]
-    """The log weight of a hypothesis of `count` stars from its fit."""
+    """The log posterior weight of a fitted hypothesis of `count` stars."""
     compared = clutter = 0
     total = total2 = 0.0
     log_relative = 0.0
@@ -238,10 +239,10 @@ def log_weight_of(observed, stars, match, t, count, square, log_det):  # type: i
 
 @njit_no_refcount
 def log_weight_bound(observed, stars, count, compared):  # type: ignore[no-untyped-def]
-    """What a hypothesis of `count` stars can weigh at most, but for det N.
+    """An upper bound on the log weight of a hypothesis of `count` stars, apart from det N.
 
-    That is without residual, at equal magnitudes, of which `compared` of its stars
-    have one, and at the attitude presumed.
+    It assumes no residuals, equal magnitudes, of which `compared` stars have one, and the presumed
+    attitude.
     """
     n = len(observed.direction)
     clutter = with_magnitude(observed) - compared

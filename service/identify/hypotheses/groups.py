@@ -1,8 +1,7 @@
-"""Two groups of stars, each with an attitude of its own: what either is worth.
+"""Two groups of stars with an attitude each, and the share of probability of either group.
 
-Reflections, or an unreported slew within a batch, leave two groups of stars
-that chance explains neither of.  They are identified apart, and share the
-probability between them.
+Reflections, or an unreported slew within a batch, leave two groups of stars, neither explained by
+chance. The groups are identified separately, and the probability is divided between them.
 """
 
 import math
@@ -34,9 +33,12 @@ from service.vectors import read_only
 Mask = npt.NDArray[np.bool_]
 
 NOISE_SIGMAS = 6.0
-"""Half the difference of two chi-squares of 3 n degrees of freedom, of n places and magnitudes
-each, has a standard deviation of sqrt(3 n).  Four of these left 0.11 % of names of probability
-0.999 wrong: now and then a star of one group also fits the attitude of the other."""
+"""Difference of two groups' log weights, in units of sqrt(3 n), that is taken for noise.
+
+Half the difference of two chi-squares of 3 n degrees of freedom, from n places and magnitudes each,
+has a standard deviation of sqrt(3 n). With four sigmas 0.11 % of the names of probability 0.999
+were wrong: sometimes a star of one group also fits the attitude of the other.
+"""
 
 _UNMATCHED, _UNIQUE, _AMBIGUOUS = (int(outcome) for outcome in Outcome)
 
@@ -49,7 +51,7 @@ def may_be_a_group(masks: Sequence[Mask]) -> bool:
 def part_of(
     corrected: Sequence[CorrectedObservations], masks: Sequence[Mask]
 ) -> tuple[CorrectedObservations, ...]:
-    """The stars of every tracker that its mask (n,) names; a tracker may be left with none."""
+    """The observations restricted to the stars in each tracker's mask (n,)."""
     return tuple(
         structs.replace(
             each,
@@ -64,7 +66,7 @@ def part_of(
 
 
 def of_all(part: Identification, mask: Mask) -> Identification:
-    """The identification of a part of the stars as one of all, the others unmatched."""
+    """The identification of some of the stars, extended to all with the others unmatched."""
     n = len(mask)
     places = np.flatnonzero(mask).tolist()
 
@@ -93,11 +95,11 @@ def of_all(part: Identification, mask: Mask) -> Identification:
 
 
 def shared(found: Identification, rival: Identification, share: float) -> Identification:
-    """What is left of an identification whose attitude has so small a share of the probability.
+    """An identification whose probabilities are reduced to its attitude's share.
 
-    A star that it names keeps the share; one that the rival names gets the rest
-    as the probability of that name.  A name below the probability of `unique`
-    becomes the first of the star's rivals.
+    A name keeps its probability times the share; where the rival identification names the star too,
+    its name gets the rest. A name below the probability of `unique` becomes the first of the star's
+    rivals.
     """
     n = len(found.star)
     outcome, star, probability = found.outcome.copy(), found.star.copy(), found.probability.copy()
@@ -138,10 +140,10 @@ def shared(found: Identification, rival: Identification, share: float) -> Identi
 
 
 def first_share(log_weight: float, other_log_weight: float, stars: int) -> float:
-    """The share of the first of two groups by their log weights, the smaller one of so many stars.
+    """Probability share of the first of two groups by log weights; `stars` in the smaller group.
 
-    Either group has noise of its own, which says nothing of which of them is real:
-    so much of the difference of their weights is left out.
+    The noise of the groups' chi-squares does not show which one is real, so that part of the
+    difference of weights is ignored.
     """
     difference = log_weight - other_log_weight
     noise = NOISE_SIGMAS * math.sqrt(3.0 * stars)
@@ -152,9 +154,9 @@ def first_share(log_weight: float, other_log_weight: float, stars: int) -> float
 def log_weight_of_group(
     seen: SightingColumns, s: int, zone: Zone, star: Integers, run_catalog: RunCatalog
 ) -> float:
-    """How much all stars of a sighting weigh where those with a row (n,) are these stars.
+    """The log posterior weight of a sighting's stars, identified with catalog rows `star` (n,).
 
-    The same measure as that of hypotheses (see `evidence`), with the others clutter.
+    The measure is that of hypotheses (see `evidence`); stars with -1 are clutter.
     """
     if not len(star):
         return 0.0
@@ -171,9 +173,10 @@ def log_weight_of_group(
 
 @njit(nogil=True, error_model="numpy")
 def _log_weight_of(sighted, star_direction, star_magnitude, star, density):  # type: ignore[no-untyped-def]
-    """The log weight of stars, -1 in `star` (n,) for none, of these directions and magnitudes.
+    """The log posterior weight of observed stars with given catalog directions and magnitudes.
 
-    `density` is the logarithm of the zone's stars per steradian.
+    `star` (n,) holds their rows, -1 for clutter; `density` is the logarithm of the zone's stars per
+    steradian.
     """
     sigma_rad = sighted.sigma_rad
     n = len(sigma_rad)
@@ -198,7 +201,7 @@ def _log_weight_of(sighted, star_direction, star_magnitude, star, density):  # t
         matched += star[k] >= 0
     if matched < 2:
         return evidence.log_null(n, with_magnitude(observed))
-    # Only places and magnitudes are weighed: there is no grid, and no bounds.
+    # Only positions and magnitudes are used: the star grid and the bounds are empty.
     nothing, rows = np.empty(0), np.empty(0, np.int32)
     stars = ZoneStars(
         direction=star_direction,

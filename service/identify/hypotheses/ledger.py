@@ -1,4 +1,4 @@
-"""The ledger of hypotheses: which are known and kept, and what they all say of each star."""
+"""Ledger of hypotheses: the heaviest ones found, and the marginal probabilities of each star."""
 
 import math
 from typing import Any, NamedTuple
@@ -11,16 +11,16 @@ from service.identify.hypotheses.scene import Progress
 from service.vectors import Vector
 
 FEW = 32
-"""Hypotheses that are looked through one by one; of more there is a table by hash."""
+"""Number of hypotheses up to which the ledger is searched linearly; beyond, by a hash table."""
 LEAST_GROUP = 3
 """Least number of unexplained stars for which a second attitude is searched."""
 RIVAL_PROBABILITY = 1e-3
-"""A star at least this likely is named among the rivals of one that is not unique."""
+"""Least probability of a star that is listed among the rivals of an ambiguous one."""
 
 
 @njit_inlined
 def known(match, ledger, count):  # type: ignore[no-untyped-def]
-    """True if the ledger, which has `count` hypotheses, holds this match."""
+    """True if the ledger's first `count` hypotheses include a match."""
     if count <= FEW:
         for h in range(count):  # noqa: SIM110 - compiled, without a generator
             if _same(match, ledger, h):
@@ -46,7 +46,7 @@ def _same(match, ledger, h):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def _hash(match):  # type: ignore[no-untyped-def]
-    """A number that scatters hypotheses, also those that differ in one star."""
+    """A hash of a match that separates hypotheses differing in one star."""
     hashed = 0
     for row in match:
         hashed = (hashed ^ (row + 1)) * 73856093
@@ -55,7 +55,7 @@ def _hash(match):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def _enter(ledger, h):  # type: ignore[no-untyped-def]
-    """Write the place of hypothesis h into the table by hash."""
+    """Enter hypothesis h into the ledger's hash table."""
     table = ledger.table
     at = _hash(ledger.match[h]) & (len(table) - 1)
     while table[at] >= 0:
@@ -65,7 +65,7 @@ def _enter(ledger, h):  # type: ignore[no-untyped-def]
 
 @njit_inlined
 def is_part(match, whole):  # type: ignore[no-untyped-def]
-    """True if every star of a match is the same in another match."""
+    """True if every star of a match is identified alike in another match."""
     apart = 0
     for k in range(len(match)):
         apart += match[k] >= 0 and match[k] != whole[k]
@@ -74,10 +74,10 @@ def is_part(match, whole):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def leaves_a_group(match):  # type: ignore[no-untyped-def]
-    """True if a match leaves enough stars unexplained for another attitude to explain them.
+    """True if a match leaves enough stars unexplained for a second attitude.
 
-    A reflection doubles every star, and a slew halves them: chance explains
-    neither half, so that the first hypothesis beyond chance is not the only one.
+    A reflection doubles every star, and a slew splits the stars: chance explains neither half, so
+    that a first significant hypothesis may have a second beside it.
     """
     unexplained = 0
     for row in match:
@@ -87,9 +87,9 @@ def leaves_a_group(match):  # type: ignore[no-untyped-def]
 
 @njit_allocating
 def _smallest(values: Vector, at: int) -> float:
-    """The value before which so many are smaller, found as by Hoare (1961, algorithm 65).
+    """The value at a rank in ascending order, by Hoare's selection (1961, algorithm 65).
 
-    numba's `np.partition` takes three seconds to compile.
+    Compiling numba's `np.partition` would take three seconds.
     """
     left = values.copy()
     low, high = 0, len(left) - 1
@@ -114,14 +114,16 @@ def _smallest(values: Vector, at: int) -> float:
 
 @njit_no_refcount
 def clear(ledger):  # type: ignore[no-untyped-def]
-    """Forget the heaviest hypotheses of an earlier search; the others go with its count."""
+    """Reset the heaviest hypotheses of an earlier search; the other entries are ignored by
+    count.
+    """
     ledger.heaviest_match[:] = -1
     ledger.heaviest[0] = ledger.heaviest_dropped[0] = -math.inf
 
 
 @njit_inlined
 def spent(progress, work):  # type: ignore[no-untyped-def]
-    """The progress after so much more work."""
+    """The progress of a search after additional work."""
     return Progress(
         *(progress.count, progress.unexplored_weight, progress.best),
         *(progress.work + work, progress.max_work),
@@ -130,23 +132,23 @@ def spent(progress, work):  # type: ignore[no-untyped-def]
 
 @njit_inlined
 def at_bound(progress):  # type: ignore[no-untyped-def]
-    """True if the search has done all the work that its budget allows."""
+    """True if a search has reached its work limit."""
     return progress.work >= progress.max_work
 
 
 @njit_inlined
 def left_unexplored(progress, log_weight):  # type: ignore[no-untyped-def]
-    """The progress with a log weight added to what is not kept."""
+    """The progress of a search with a log weight added to the unexplored weight."""
     total = log_sum(progress.unexplored_weight, log_weight)
     return Progress(progress.count, total, progress.best, progress.work, progress.max_work)
 
 
 @njit_no_refcount
 def keep(match, value, ledger, progress):  # type: ignore[no-untyped-def]
-    """Keep a weighed hypothesis; the progress after it.
+    """Add a weighed hypothesis to the ledger; returns the progress.
 
-    Where the ledger is full, the lightest quarter goes to the unexplored weight, and
-    from then on whatever is no heavier.
+    Where the ledger is full, the lightest quarter goes to the unexplored weight, and from then on
+    so does any hypothesis that is no heavier.
     """
     log_weight, count, unexplored = ledger.log_weight, progress.count, progress.unexplored_weight
     best, work, max_work = progress.best, progress.work, progress.max_work
@@ -174,7 +176,9 @@ def keep(match, value, ledger, progress):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def _drop_lightest(ledger, count, unexplored):  # type: ignore[no-untyped-def]
-    """Drop the lightest quarter; how many are left, and the unexplored weight with theirs."""
+    """Drop the lightest quarter of the ledger; returns the number left and the unexplored
+    weight.
+    """
     log_weight = ledger.log_weight
     quarter = count // 4
     floor = ledger.heaviest_dropped[0] = _smallest(log_weight, quarter)
@@ -194,13 +198,12 @@ def _drop_lightest(ledger, count, unexplored):  # type: ignore[no-untyped-def]
 
 
 class StarPosterior(NamedTuple):
-    """What the hypotheses say of each of n stars, as kernels write it.
+    """The posterior of each of n stars, summed over hypotheses, as arrays filled by kernels.
 
-    `star` (n,) is the likeliest zone row, -1 where there is none, `probability`
-    (n,) its share, and `none` (n,) that of no star of the zone.  `rivals` (n, R) are
-    all rows in question by falling `rival_probability` (n, R), -1 beyond the last.
-    `hypothesis` (n,) are the rows of the heaviest hypothesis, -1 where it explains
-    nothing.
+    `star` (n,) is the most likely zone row, -1 for none, `probability` (n,) its probability, and
+    `none` (n,) that of no star of the zone. `rivals` (n, R) are all possible rows by decreasing
+    `rival_probability` (n, R), -1 after the last. `hypothesis` (n,) has the rows of the heaviest
+    hypothesis, -1 for unexplained stars.
     """
 
     star: Any
@@ -213,7 +216,7 @@ class StarPosterior(NamedTuple):
 
 @njit(nogil=True)
 def marginals(ledger, count, unexplored_weight, posterior):  # type: ignore[no-untyped-def]
-    """Sum up the first `count` hypotheses of a ledger; into all of `posterior` but `hypothesis`."""
+    """Sum the first `count` hypotheses of a ledger into star probabilities, except `hypothesis`."""
     rivals, rival_probability = posterior.rivals, posterior.rival_probability
     log_weight = ledger.log_weight
     n, listed = rivals.shape
@@ -241,7 +244,7 @@ def marginals(ledger, count, unexplored_weight, posterior):  # type: ignore[no-u
             if row < 0:
                 nothing += weight[h]
                 continue
-            # In order of rows, those of one star stand together.
+            # Sorted by row, the entries of one star are adjacent.
             at = max(different - 1, 0) if many else 0
             while at < different and rows[at] != row:
                 at += 1

@@ -1,4 +1,4 @@
-"""A hypothesis matched anew at its own attitude, and weighed with the hypotheses next to it."""
+"""Local improvement of a hypothesis: matched again at its attitude, and similar ones weighed."""
 
 import math
 
@@ -16,21 +16,21 @@ from service.identify.hypotheses.scene import Progress, within_bounds
 from service.sky.geometry.star_hashes import nearest
 
 MATCH_GATE = 34.0
-"""In sigmas: how far a star may lie from where a hypothesis's attitude puts it."""
+"""Largest distance of a star from its predicted place, in sigmas, for matching again."""
 LARGEST_GATE_RAD = 0.009
 NEGLIGIBLE = 18.0
-"""A hypothesis lighter than the best by this, in logarithms, is only counted, not kept."""
+"""Log weight below the best at which a hypothesis is only summed, not kept."""
 NEAR_SIGMAS, NEAR_MAG, RARE = 3.0, 0.5, -6.0
-"""How near a matched star lies that is not tried as clutter, where chance neighbours are rare."""
+"""Sigmas, magnitude difference and rarity of chance neighbours for a star surely no clutter."""
 
 
 @njit_no_refcount
 def consider(observed, stars, match, scratch, ledger, progress):  # type: ignore[no-untyped-def]
-    """Fit a hypothesis, match all stars anew at its attitude, weigh it and its neighbours.
+    """Fit a hypothesis, match all stars again at its attitude, and weigh it and similar ones.
 
-    Its neighbours are the hypotheses without one of its stars, unless that one
-    sits well, and with a star's second-nearest neighbour in its place.  Returns
-    the progress, and whether the stars fit together at all.
+    Similar hypotheses lack one of its stars, unless that star fits well, or have a star's
+    second-nearest neighbour instead. Returns the progress, and whether the stars fit together at
+    all.
     """
     n = len(match)
     matched, square, log_det = fit_match(observed, stars, match, scratch, 1)
@@ -70,7 +70,7 @@ def consider(observed, stars, match, scratch, ledger, progress):  # type: ignore
         mine = fresh[k]
         fresh[k] = second[k]
         if not known(fresh, ledger, progress.count):
-            # This fits anew: nothing below may need the fit of the hypothesis itself.
+            # This refits the attitude: nothing below may rely on the fit of the given hypothesis.
             value = weigh(observed, stars, fresh, scratch)
             progress = _keep_best(fresh, value, ledger, spent(progress, work_of_fit(n, matched)))
         fresh[k] = mine
@@ -79,7 +79,7 @@ def consider(observed, stars, match, scratch, ledger, progress):  # type: ignore
 
 @njit_no_refcount
 def _keep_best(match, value, ledger, progress):  # type: ignore[no-untyped-def]
-    """Keep a hypothesis of three stars or more, and its weight where it is the best."""
+    """Add a hypothesis of three or more stars to the ledger, and update the best weight."""
     after = keep(match, value, ledger, progress)
     return Progress(
         *(after.count, after.unexplored_weight, max(after.best, value)),
@@ -89,7 +89,7 @@ def _keep_best(match, value, ledger, progress):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def _names(match, row):  # type: ignore[no-untyped-def]
-    """True if a match names a zone star."""
+    """True if a match contains a given zone star."""
     for one in match:  # noqa: SIM110 - compiled, without a generator
         if one == row:
             return True
@@ -98,10 +98,10 @@ def _names(match, row):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def _neighbours_are_rare(observed, stars):  # type: ignore[no-untyped-def]
-    """True if chance hardly ever puts a star of the zone within the widest scale of noise.
+    """True if chance rarely puts a zone star within the widest scale of noise.
 
-    Its probability is rho 2 pi s^2; where that is as rare as e^-6, the hypothesis
-    without a star that sits well weighs less than about e^-8 of the one with it.
+    Its probability is rho 2 pi s^2; where that is as rare as e^-6, the hypothesis without a
+    well-fitting star weighs less than about e^-8 of the one with it.
     """
     widest = evidence.POSITION_SCALES[-1] * observed.reference_sigma
     return stars.log_density + math.log(2.0 * math.pi * widest * widest) <= RARE
@@ -109,8 +109,8 @@ def _neighbours_are_rare(observed, stars):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, inline="always")
 def _sits_well(observed, stars, match, k, scratch):  # type: ignore[no-untyped-def]
-    """True if a star fits so well, in place and magnitude, that it can hardly be clutter."""
-    # False where there is no magnitude, as with any comparison with NaN.
+    """True if a star fits so well in place and magnitude that it can hardly be clutter."""
+    # Comparison with NaN gives False where there is no magnitude.
     if abs(observed.magnitude[k] - stars.magnitude[match[k]]) > NEAR_MAG:
         return False
     t, direction, references = scratch.t, observed.direction, scratch.references

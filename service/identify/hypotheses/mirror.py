@@ -1,9 +1,8 @@
-"""The mirror test: whether a field fits the sky better when its image is reflected.
+"""The mirror test: whether the reflected image of a field fits the sky better.
 
-A tracker with an axis of the wrong sign, or two that are exchanged, sends a
-mirrored field.  No rotation takes the sky to it, but three or four of its
-stars that lie alike on both sides of a line may fit by themselves.  Reflected
-once more the whole field fits, which tells the two apart.
+A tracker with an axis of the wrong sign, or with two exchanged axes, sends a mirrored field. No
+rotation matches the whole field to the sky, but three or four stars that are symmetric about a line
+may match. The reflected field matches as a whole, which distinguishes the two cases.
 """
 
 import math
@@ -23,17 +22,19 @@ from service.identify.sighting import PRIOR_DIRECTION
 LOG_MIRRORED = -7.0
 """Prior log odds of a tracker with mirrored axes: one in a thousand."""
 NO_MIRROR_ABOVE = 30.0
-"""A hypothesis heavier than the null by more is not held against a mirror.
+"""Log weight over the null above which a hypothesis is not tested against a mirror.
 
-Of mirrored fields of 5 and of 10 stars 99 in 100 wrong hypotheses are heavier by less than 21.
+Of the wrong hypotheses for mirrored fields of 5 and of 10 stars, 99 % are heavier by less than 21.
 """
 FEWEST_MIRRORED = 3
-"""Two stars are the mirror image of themselves."""
+"""Least number of stars for the mirror test: two are the mirror image of themselves."""
 
 
 @njit_no_refcount
 def may_be_mirrored(observed, ledger):  # type: ignore[no-untyped-def]
-    """True if the heaviest hypothesis leaves stars unexplained and is weak enough for a mirror."""
+    """True if the heaviest hypothesis leaves stars unexplained and is weak enough for a mirror
+    test.
+    """
     match = ledger.heaviest_match
     n = len(match)
     matched = 0
@@ -46,8 +47,8 @@ def may_be_mirrored(observed, ledger):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def reflect(observed, boresight, image):  # type: ignore[no-untyped-def]
-    """Write the mirror image of directions (n, 3), across a plane through the boresight."""
-    # The normal of the plane: across the boresight, and any such will do.
+    """Reflect directions (n, 3) at a plane through the boresight, into `image`."""
+    # The plane's normal may be any direction perpendicular to the boresight.
     least = 0
     for i in range(1, 3):
         if abs(boresight[i]) < abs(boresight[least]):
@@ -66,7 +67,7 @@ def reflect(observed, boresight, image):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def in_a_mirror(observed, image):  # type: ignore[no-untyped-def]
-    """The same stars with the directions of their mirror image."""
+    """The observed stars with reflected directions."""
     return ObservedStars(
         direction=image,
         magnitude=observed.magnitude,
@@ -81,9 +82,9 @@ def in_a_mirror(observed, image):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def weigh_in_a_mirror(image, boresight, stars, pairs, max_work):  # type: ignore[no-untyped-def]
-    """The log weight of the mirror image's heaviest hypothesis; with the work.
+    """The log weight of the heaviest hypothesis for a mirror image, and the work of its search.
 
-    Minus infinity where fewer than three of its stars fit.
+    Minus infinity where fewer than three stars match.
     """
     n = len(image.direction)
     scratch, ledger = scratch_for(n), ledger_for(n)
@@ -103,11 +104,11 @@ def weigh_in_a_mirror(image, boresight, stars, pairs, max_work):  # type: ignore
 
 @njit_no_refcount
 def _log_prior_of_image(image, boresight, t):  # type: ignore[no-untyped-def]
-    """The log density of an attitude that the image was found at, per cubed radian of rotation.
+    """The log prior density of an attitude found for a mirror image, per cubed radian.
 
-    Which way the axes are mirrored is not known, and a wrong guess turns the image about the
-    boresight.  What is presumed says no more of it than the angle between boresight and
-    presumed axis or, where that is a whole attitude, where the boresight points.
+    The sense of the reflection is unknown, and a wrong guess rotates the image about the boresight.
+    So the prior is used only for the angle between boresight and presumed axis or, for a whole
+    attitude, for the direction of the boresight.
     """
     presumed, found = 1.0, 0.0
     if image.prior_kind == PRIOR_DIRECTION:

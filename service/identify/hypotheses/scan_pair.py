@@ -27,20 +27,19 @@ from service.identify.sighting import PRIOR_DIRECTION
 from service.sky.geometry.star_hashes import level_for, nearest, star_within_reach
 
 MAX_THIRDS = 8
-"""Stars tried one by one with a pair if all together do not fit: those that the pair fixes best."""
+"""Number of third stars tried one by one with a pair if all stars together do not fit."""
 AGREEING_TILT_RAD = math.radians(3.0)
-"""Pairs whose difference of angles to a presumed axis a tilt so small explains go first."""
+"""Largest tilt of a presumed axis that still explains a pair's difference of angles to the axis."""
 INITIAL_SLACK = 12.0
-"""Before anything is found the best is taken to be a hypothesis of all stars, less this."""
+"""Log weight by which the first guess of the best hypothesis is below the bound for all stars."""
 
 
 class Scan(NamedTuple):
-    """One pass through the candidates of observed stars i and j.
+    """One pass over the catalog candidates of observed stars i and j.
 
-    `others` stars of other groups are predicted.  A candidate weighs less than
-    the `weight_bound` of its stars by `log_penalty` at least.  Where an axis is
-    presumed (`by_axis`) the pass is of the candidates that agree with it, or of
-    those that do not, as `agreeing` says.
+    `others` stars of other groups are predicted. A candidate weighs at least `log_penalty` less
+    than the `weight_bound` of its stars. With a presumed axis (`by_axis`) a pass covers either the
+    candidates that agree with the axis or the others, according to `agreeing`.
     """
 
     i: Any
@@ -55,7 +54,7 @@ class Scan(NamedTuple):
 
 @njit_inlined
 def weight_bound(count, observed, stars, bounds):  # type: ignore[no-untyped-def]
-    """The most that so many stars can weigh, but for det N, worked out once in a search."""
+    """Cached upper bound on the log weight of a hypothesis of `count` stars, apart from det N."""
     if np.isnan(bounds[count]):
         compared = min(count, with_magnitude(observed))
         bounds[count] = log_weight_bound(observed, stars, count, compared)
@@ -66,14 +65,13 @@ def weight_bound(count, observed, stars, bounds):  # type: ignore[no-untyped-def
 def scan_pair(  # type: ignore[no-untyped-def]
     observed, stars, pairs, pair, accept_threshold, scratch, ledger, progress
 ):
-    """Try every candidate pair in the place of an observed pair, either way round; the progress.
+    """Try every catalog pair for an observed pair, in both orders; returns the progress.
 
-    Where an axis is presumed, those go first that agree with it, and the others
-    not at all once the best is heavier than `accept_threshold` and leaves no group of
-    stars.  A candidate is left as soon as the stars that it may still match cannot make
-    it matter; the most that all those can weigh goes to the unexplored weight.  How many
-    stars matter depends on the best, which is not known at first: the initial guess of it
-    is replaced, and the candidates are passed through again, where it was too high.
+    With a presumed axis, candidates that agree with the axis go first; the others are skipped once
+    the best is heavier than `accept_threshold` and leaves no group of stars. A candidate is dropped
+    as soon as its possible matches cannot make it matter; the upper bound of all dropped candidates
+    goes to the unexplored weight. The number of stars that matter depends on the best weight, which
+    is guessed at first; where the guess was too high, the candidates are scanned again.
     """
     others, sine2 = _predictors(observed, pair.i, pair.j, scratch)
     if sine2 <= 0.0 or others == 0:
@@ -84,7 +82,7 @@ def scan_pair(  # type: ignore[no-untyped-def]
     by_axis = observed.prior_kind == PRIOR_DIRECTION and len(pairs.polar_difference) > 0
     for agreeing in (True, False):
         if by_axis and not agreeing:
-            # What does not agree tilts the axis, which is unlikely beforehand.
+            # Candidates that disagree need a tilted axis, which is unlikely a priori.
             log_penalty += LOG_PRIOR_AT_BEST[PRIOR_DIRECTION] - log_prior(
                 AGREEING_TILT_RAD, PRIOR_DIRECTION
             )
@@ -98,7 +96,7 @@ def scan_pair(  # type: ignore[no-untyped-def]
             if needed >= fewest or at_bound(progress):
                 break
             fewest = needed
-        # Fewer than three are no hypothesis of this search.
+        # The search has no hypotheses of fewer than three stars.
         for m in range(3, others + 3):
             if deferred[m]:
                 bound = weight_bound(m, observed, stars, bounds)
@@ -111,17 +109,17 @@ def scan_pair(  # type: ignore[no-untyped-def]
 
 @njit_inlined
 def _score_candidates(observed, stars, pairs, scan, fewest, scratch, ledger, progress):  # type: ignore[no-untyped-def]
-    """Go once through the candidates of a scan; the progress.
+    """Pass once over the candidates of a scan; returns the progress.
 
-    What matches less than `fewest` stars is counted in `scratch.deferred_counts` by the
-    most that it may match; the number rises with the best that is found.
+    A candidate with fewer than `fewest` matches is counted in `scratch.deferred_counts` by its
+    largest possible number of matches; `fewest` rises with the best weight.
     """
     deferred, direction, voxels = scratch.deferred_counts, stars.direction, stars.voxels
     brighter, dimmer, difference = pairs.brighter, pairs.dimmer, pairs.polar_difference
     others, by_axis, agreeing = scan.others, scan.by_axis, scan.agreeing
     deferred[:] = 0
     scratch.match[:] = -1
-    # These nearly always decide, the first of them where none may be missing.
+    # The first two predicted stars reject most candidates; the first alone if none may be missing.
     one, two = _test(scratch, others, 0), _test(scratch, others, 1)
     three = _test(scratch, others, 2)
     polar = tolerance = 0.0
@@ -142,7 +140,7 @@ def _score_candidates(observed, stars, pairs, scan, fewest, scratch, ledger, pro
         w0, w1, w2 = u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0
         for swap in range(2):
             if swap:
-                # The other way round, and their product changes sign.
+                # In the other order the cross product changes sign.
                 a, b = b, a
                 u0, u1, u2, v0, v1, v2 = v0, v1, v2, u0, u1, u2
                 w0, w1, w2 = -w0, -w1, -w2
@@ -172,10 +170,9 @@ def _score_candidates(observed, stars, pairs, scan, fewest, scratch, ledger, pro
 
 @njit_inlined
 def _evaluate(observed, stars, scan, a, b, fewest, scratch, ledger, progress):  # type: ignore[no-untyped-def]
-    """Put zone stars a and b in the place of the observed pair, and consider what they match.
+    """Match zone stars a and b with the observed pair, and consider the other stars predicted.
 
-    Returns how many stars at most are matched where they are fewer than `fewest`,
-    and the progress.
+    Returns the largest possible number of matches if it is below `fewest`, and the progress.
     """
     match, used, order = scratch.match, scratch.used, scratch.order
     others = scan.others
@@ -198,8 +195,8 @@ def _evaluate(observed, stars, scan, a, b, fewest, scratch, ledger, progress):  
     progress, fits = consider(observed, stars, match, scratch, ledger, progress)
     if fits:
         return matched, progress
-    # Where gates are wide, clutter meets a star of the zone by chance: one such
-    # spoils the fit of all, or has taken the star of another.  So each by itself.
+    # With wide gates clutter matches by chance and spoils the common fit; so each match is tried
+    # alone.
     third = -1
     for at in range(0 if matched > 3 else others):
         if match[order[at]] >= 0:
@@ -221,7 +218,7 @@ def _evaluate(observed, stars, scan, a, b, fewest, scratch, ledger, progress):  
 
 @njit_inlined
 def _nearest_to_predicted(stars, scratch, a, b, k, taken):  # type: ignore[no-untyped-def]
-    """The zone star where the pair (a, b) puts observed star k, -1 for none."""
+    """The zone star nearest to a pair's (a, b) prediction for observed star k; -1 for none."""
     u, v, part = stars.direction[a], stars.direction[b], scratch.parts[k]
     one, _ = nearest(
         part[0] * u[0] + part[1] * v[0] + part[2] * (u[1] * v[2] - u[2] * v[1]),
@@ -239,7 +236,7 @@ def _nearest_to_predicted(stars, scratch, a, b, k, taken):  # type: ignore[no-un
 
 @njit_no_refcount
 def _half_log_det(observed, i, j, order, others):  # type: ignore[no-untyped-def]
-    """The least of 1/2 ln det N of stars i and j and one of the others; more stars only add."""
+    """The least 1/2 ln det N for stars i, j and one other; additional stars only increase it."""
     least = math.inf
     wi, wj = observed.weight[i], observed.weight[j]
     vi, vj = observed.direction[i], observed.direction[j]
@@ -264,7 +261,7 @@ def _half_log_det(observed, i, j, order, others):  # type: ignore[no-untyped-def
 
 @njit_inlined
 def _test(scratch, others, at):  # type: ignore[no-untyped-def]
-    """How one of the others in order is predicted, and its level of voxels, -1 where none tells."""
+    """Prediction coefficients and voxel level of one of the other stars; level -1 if unusable."""
     if at >= others:
         return 0.0, 0.0, 0.0, -1
     k = scratch.order[at]
@@ -274,7 +271,9 @@ def _test(scratch, others, at):  # type: ignore[no-untyped-def]
 
 @njit_inlined
 def _missing(voxels, test, u0, u1, u2, v0, v1, v2, w0, w1, w2):  # type: ignore[no-untyped-def]
-    """1 if no star can stand where a pair u, v with the product w predicts one, else 0."""
+    """1 if no star can be at the place predicted by a pair u, v with the cross product w, else
+    0.
+    """
     alpha, beta, gamma, level = test
     if level < 0:
         return 0
@@ -289,7 +288,7 @@ def _missing(voxels, test, u0, u1, u2, v0, v1, v2, w0, w1, w2):  # type: ignore[
 
 @njit_inlined
 def _fewest(observed, stars, scan, best, bounds):  # type: ignore[no-untyped-def]
-    """The fewest stars with which a candidate of a scan matters beside the best."""
+    """The least number of matches with which a candidate of a scan matters beside the best."""
     fewest = 3
     while fewest <= scan.others + 2 and (
         weight_bound(fewest, observed, stars, bounds) - scan.log_penalty < best - NEGLIGIBLE
@@ -300,11 +299,11 @@ def _fewest(observed, stars, scan, best, bounds):  # type: ignore[no-untyped-def
 
 @njit_no_refcount
 def _predictors(observed, i, j, scratch):  # type: ignore[no-untyped-def]
-    """Write every star of other groups as alpha V_i + beta V_j + gamma V_i x V_j.
+    """Express every star of other groups as alpha V_i + beta V_j + gamma V_i x V_j.
 
-    A catalog pair (a, b) in the place of (i, j) then puts it at
-    alpha a + beta b + gamma a x b, without an attitude.  Returns how many there
-    are, in order with the best fixed first, and the squared sine of the pair's angle.
+    A catalog pair (a, b) for (i, j) then predicts it at alpha a + beta b + gamma a x b, without an
+    attitude. Returns the number of predicted stars, which are ordered by accuracy, and the squared
+    sine of the pair's angle.
     """
     direction, sigma_rad, group_of = observed.direction, observed.sigma_rad, scratch.group_of
     n = len(direction)

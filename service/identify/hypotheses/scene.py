@@ -1,8 +1,8 @@
-"""What a search for hypotheses reads and writes, as named tuples of arrays and numbers.
+"""The input and work arrays of a hypothesis search, as named tuples for kernels.
 
-Vectors are in the presumed frame: inertial axes as the a priori attitude has
-them.  The attitude T of a hypothesis takes catalog directions to that frame,
-so that T is the identity where the a priori attitude is right.
+Vectors are in the presumed frame: inertial axes according to the a priori attitude. The attitude T
+of a hypothesis rotates catalog directions to that frame, so that T is the identity where the a
+priori attitude is right.
 """
 
 import math
@@ -14,15 +14,15 @@ from service.compiled.jit import njit, njit_inlined, njit_no_refcount
 from service.sky.geometry.directions import separation_rad
 
 MAX_HYPOTHESES = 2048
-"""Kept of a search, a power of two; lighter ones are only added up."""
+"""Number of hypotheses kept in a search, a power of two; lighter ones are only summed."""
 PREDICTION_GATE = 20.0
-"""In sigmas: how far a star may lie from where a pair of others puts it."""
+"""Largest distance, in sigmas, of a star from its place predicted by a pair of stars."""
 MAX_SEEDS = 12
-"""Pairs of at most so many stars, the brightest, are scanned; all are matched."""
+"""Number of brightest stars whose pairs are scanned; all stars are matched."""
 
 
 class ObservedStars(NamedTuple):
-    """The observed stars (n): directions, magnitudes (NaN: none), sigmas, and the prior.
+    """Observed stars (n) of a search: directions, magnitudes (NaN: none), sigmas, and the prior.
 
     `weight` is (reference_sigma / sigma)^2.  `velocity` of the observer is in
     units of c, zero where aberration is not to be corrected.
@@ -39,10 +39,10 @@ class ObservedStars(NamedTuple):
 
 
 class ZoneStars(NamedTuple):
-    """The zone's stars (m) with their grid, and the exact bounds on the angle to its axis.
+    """The zone's stars (m) with a search grid, and exact bounds on the angle to the zone's axis.
 
-    `polar` (m,) keeps that angle once it was worked out; -1: not yet.
-    `log_density` is the logarithm of the stars within the bounds per steradian.
+    `polar` (m,) caches that angle; -1 if not computed yet. `log_density` is the logarithm of the
+    stars within the bounds per steradian.
     """
 
     direction: Any
@@ -59,9 +59,9 @@ class ZoneStars(NamedTuple):
 
 
 class ZonePairs(NamedTuple):
-    """The zone's pair index, as in `sky.geometry.pairs`, and the pairs' polar differences.
+    """The zone's pair index, as in `sky.geometry.pairs`, with differences of polar angles.
 
-    Those are about the zone's own axis, which lies `off_axis` radians from the exact one.
+    The polar angles are about the zone's own axis, which is `off_axis` radians from the exact one.
     """
 
     separation: Any
@@ -74,20 +74,18 @@ class ZonePairs(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Work arrays of a search of n stars, allocated once; the next search may use them again.
+    """Reusable work arrays of a search for n stars.
 
-    Of the present hypothesis: `match` (n,) its zone rows, `used` (n,) the zone
-    rows taken so far, `nearest` and `second` (n,) the two nearest zone stars at its
-    attitude, `references` (n, 3) the apparent directions of its stars, `t` (3, 3)
-    its attitude, `matrix` N and `inverse` (3, 3), `smaller` and `turned` (3, 3) the
-    same with a star left out.
-    Of the present pair: `order` (n + 1,) the other stars, the best predicted first,
-    their coefficients `parts` (n, 3) and `gate` (n,).
-    By number of stars: `weight_bounds` (n + 1,) the most that they can weigh, NaN
-    where not worked out, and `deferred_counts` (n + 1,) the candidates not looked into.
-    Of the s seeds: their stars `seeds` (s,) and `group` (s,), `group_of` (n + 1,) by
-    star, and by pair of seeds the range of candidates `first_pair` to `last_pair`
-    (s, s), their `separation` and the `cost` (s, s) of joining two groups.
+    For the present hypothesis: `match` (n,) its zone rows, `used` (n,) the zone rows taken so far,
+    `nearest` and `second` (n,) the two nearest zone stars at its attitude, `references` (n, 3) the
+    apparent directions of its stars, `t` (3, 3) its attitude, `matrix` N and `inverse` (3, 3),
+    `smaller` and `turned` (3, 3) both with one star left out. For the present pair: `order` (n +
+    1,) the other stars, the best predicted first, their coefficients `parts` (n, 3) and `gate`
+    (n,). By number of stars: `weight_bounds` (n + 1,) upper bounds of their weight, NaN if not
+    computed, and `deferred_counts` (n + 1,) the candidates not examined. For the s seeds: their
+    stars `seeds` (s,) and `group` (s,), `group_of` (n + 1,) by star, and by pair of seeds the range
+    of candidates `first_pair` to `last_pair` (s, s), their `separation` and the `cost` (s, s) of
+    joining two groups.
     """
 
     match: Any
@@ -115,12 +113,11 @@ class Scratch(NamedTuple):
 
 
 class Ledger(NamedTuple):
-    """The hypotheses kept so far: their matches and log weights, in the order found.
+    """The hypotheses kept by a search: their matches and log weights, in the order found.
 
-    `match` (MAX_HYPOTHESES, n) and `log_weight` (MAX_HYPOTHESES,); `table` finds a
-    match by its hash.  `heaviest_match` (n,) is that of the heaviest of all,
-    `heaviest` (1,) its log weight, and `heaviest_dropped` (1,) that of the heaviest
-    that was dropped.
+    `match` (MAX_HYPOTHESES, n) and `log_weight` (MAX_HYPOTHESES,); `table` finds a match by its
+    hash. `heaviest_match` (n,) is the match of the heaviest hypothesis, `heaviest` (1,) its log
+    weight, and `heaviest_dropped` (1,) that of the heaviest dropped one.
     """
 
     match: Any
@@ -132,12 +129,11 @@ class Ledger(NamedTuple):
 
 
 class Progress(NamedTuple):
-    """How far a search has come; made anew at every step.
+    """The immutable progress of a search: counts, best weight, unexplored weight, and work.
 
-    `count` hypotheses are in the ledger.  `unexplored_weight` is the log weight of
-    the null and of all that was too light, or too much, to keep.  `best` is the
-    heaviest of three stars or more; `work` counts stars looked up and fitted, and the
-    search ends where it reaches `max_work`.
+    `count` hypotheses are in the ledger. `unexplored_weight` is the log weight of the null
+    hypothesis and of all that were dropped. `best` is the heaviest of three or more stars; `work`
+    counts stars looked up and fitted, and the search ends at `max_work`.
     """
 
     count: Any
@@ -149,7 +145,7 @@ class Progress(NamedTuple):
 
 @njit(nogil=True)
 def scratch_for(n):  # type: ignore[no-untyped-def]
-    """The work arrays for n stars."""
+    """New work arrays for a search of n stars."""
     rows = np.full((4, n), -1, np.int32)
     squares = np.empty((5, 3, 3))
     numbers = np.empty((5, n + 1), np.int64)
@@ -184,7 +180,7 @@ def scratch_for(n):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def ledger_for(n):  # type: ignore[no-untyped-def]
-    """An empty ledger of matches of n stars."""
+    """An empty ledger for matches of n stars."""
     extremes = np.full((2, 1), -math.inf)
     return Ledger(
         match=np.empty((MAX_HYPOTHESES, n), np.int32),
@@ -198,7 +194,7 @@ def ledger_for(n):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def scene_in(sighted, zone, bounds):  # type: ignore[no-untyped-def]
-    """The `ObservedStars`, `ZoneStars` and `ZonePairs` of a sighting's arrays, zone and bounds."""
+    """The `ObservedStars`, `ZoneStars` and `ZonePairs` made from a sighting, a zone and bounds."""
     sigma_rad = sighted.sigma_rad
     reference_sigma = sigma_rad.min()
     weight = np.empty(len(sigma_rad))
@@ -242,7 +238,7 @@ def scene_in(sighted, zone, bounds):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def with_magnitude(observed):  # type: ignore[no-untyped-def]
-    """How many of the observed stars have a magnitude."""
+    """The number of observed stars with a magnitude."""
     count = 0
     for magnitude in observed.magnitude:
         if not math.isnan(magnitude):
@@ -252,7 +248,7 @@ def with_magnitude(observed):  # type: ignore[no-untyped-def]
 
 @njit_inlined
 def within_bounds(row, stars):  # type: ignore[no-untyped-def]
-    """True if a zone star lies within the exact bounds."""
+    """True if a zone star lies within the exact bounds on its angle to the axis."""
     if stars.polar[row] < 0.0:
         stars.polar[row] = separation_rad(stars.direction[row], stars.axis)
     return stars.least <= stars.polar[row] <= stars.most
@@ -260,7 +256,7 @@ def within_bounds(row, stars):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def log_density(direction, axis, least, most):  # type: ignore[no-untyped-def]
-    """Logarithm of the stars per steradian between two angles from an axis."""
+    """The logarithm of the number of stars per steradian between two angles from an axis."""
     inside = 0
     inner, outer = math.cos(least), math.cos(most)
     for row in range(len(direction)):
@@ -274,10 +270,10 @@ def log_density(direction, axis, least, most):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def polar_difference(observed, i, j, tilt):  # type: ignore[no-untyped-def]
-    """The angle of star i to the axis less that of star j, and how far noise and a tilt move it.
+    """The difference of two stars' angles to the axis, and its error from noise and a tilted axis.
 
-    A tilt of the axis moves the two angles apart by at most itself times the
-    chord between the stars' directions about the axis.
+    A tilt changes the difference by at most the tilt times the chord between the stars' directions
+    about the axis.
     """
     vi, vj = observed.direction[i], observed.direction[j]
     polar_i = separation_rad(vi, observed.prior_axis)
@@ -286,7 +282,7 @@ def polar_difference(observed, i, j, tilt):  # type: ignore[no-untyped-def]
     sines = math.sin(polar_i) * math.sin(polar_j)
     chord2 = 4.0
     if sines > 0.0:
-        # By half angles, which stay accurate where the angles are small.
+        # Half angles stay accurate where the angles are small.
         half = math.sin(0.5 * apart) ** 2 - math.sin(0.5 * (polar_i - polar_j)) ** 2
         chord2 = min(4.0, max(0.0, 4.0 * half / sines))
     noise = PREDICTION_GATE * math.sqrt(observed.sigma_rad[i] ** 2 + observed.sigma_rad[j] ** 2)

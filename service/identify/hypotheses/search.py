@@ -1,16 +1,14 @@
-"""The search for hypotheses: which stars these could be, all together.
+"""The search for hypotheses: joint identifications of all observed stars.
 
-Every candidate pair of an observed pair predicts every other star; what it
-predicts well becomes a hypothesis and is weighed (see `evidence`).  Pairs are
-not gated by steps 1 to 10: the prior and the magnitudes weigh, they do not
-reject.
+Every catalog pair for an observed pair predicts the other stars; good predictions become a
+hypothesis, which is weighed (see `evidence`). Pairs are not gated by steps 1 to 10: the prior and
+the magnitudes contribute to the weight, they do not reject.
 
-Pairs are scanned so that single stars grow into groups, the cheapest cross
-pairs first.  A hypothesis with two stars of one group has been seen when the
-group grew together.  So a scan looks only for stars of other groups, and with
-g groups left what was not seen matches at most one star of each, g in all: at
-two groups all those of three stars are seen.  The hypotheses of two stars
-alone are weighed last, where no larger one settles the matter.
+Pairs are scanned so that single stars grow into groups, the cheapest cross pairs first. A
+hypothesis with two stars of one group was found when the group was formed. So a scan looks only for
+stars of other groups, and with g groups left an unseen hypothesis matches at most one star of each,
+g in all: at two groups all hypotheses of three stars were seen. Hypotheses of only two stars are
+weighed last, if no larger one is decisive.
 """
 
 import math
@@ -44,41 +42,40 @@ from service.sky.geometry.directions import separation_rad
 
 SHORT_PAIR_RAD = math.radians(0.35)
 CHANCE_PER_STAR, CHANCE_MARGIN = math.log(3.0), 12.0
-"""Stop early once a hypothesis of three stars or more outweighs the null by 3^n e^12.
+"""Log margin over the null, 3^n e^12 for n stars, at which a search may stop early.
 
-Only after a whole observed pair: the stars of an empty sky may stand so evenly
-that a half turn matches four of them, and it is found first as often as not.
-And only where it leaves so few stars unexplained that no other attitude can
-explain them: see `leaves_a_group`.
+The search stops only after a whole observed pair: stars may be spaced so evenly that a half turn
+matches four of them, and it may be found first. And it stops only if too few stars remain
+unexplained for a second attitude: see `leaves_a_group`.
 """
 LARGEST_LOG = 1e5
-"""A finite stand-in for an infinite log weight."""
+"""A finite replacement for an infinite log weight."""
 CONVERGED_LOG = 10.0
-"""Exhaustive, stop once all that was not seen is lighter than the best by this, in logarithms."""
+"""Log weight below the best at which all unseen hypotheses together end an exhaustive search."""
 
 
 @njit_no_refcount
 def search(observed, stars, pairs, exhaustive, max_work, scratch, ledger):  # type: ignore[no-untyped-def]
-    """Search for hypotheses and weigh them into the ledger; the progress, and whether bounded.
+    """Search and weigh hypotheses into the ledger; returns the progress, and true if cut short.
 
-    `scratch` and `ledger` are of as many stars; those of an earlier search will do.
-    `exhaustive`: go on after a hypothesis that outweighs chance.  Where the search ends
-    at `max_work` with nothing beyond chance, what it did not see may weigh more than
-    all that it found, and counts as unexplored.
+    `scratch` and `ledger` are work arrays for as many stars, possibly used before. With
+    `exhaustive` the search continues after a hypothesis that outweighs chance. If the search ends
+    at `max_work` without a significant hypothesis, unseen ones may outweigh the rest, and count as
+    unexplored.
     """
     n = len(observed.direction)
     scratch.weight_bounds[:] = np.nan
     clear(ledger)
     null = evidence.log_null(n, with_magnitude(observed))
     accept_threshold = null + n * CHANCE_PER_STAR + CHANCE_MARGIN
-    # No plain zeros: numba would compile all below for those constants as well.
+    # Not plain zeros: numba would compile everything again for constant types.
     progress = Progress(0 * n, null, -math.inf, 0 * n, max_work)
     seeds, group, group_of = scratch.seeds, scratch.group, scratch.group_of
     first_pair, last_pair = scratch.first_pair, scratch.last_pair
     s = len(seeds)
     _choose_seeds(observed, stars, seeds)
     _find_candidates(observed, pairs, scratch)
-    # By observed star; those that are no seeds are each by themselves.
+    # Indexed by observed star; stars that are no seeds are groups of their own.
     for k in range(n):
         group_of[k] = s + k
     for x in range(s):
@@ -122,10 +119,10 @@ def search(observed, stars, pairs, exhaustive, max_work, scratch, ledger):  # ty
 
 @njit_no_refcount
 def _most_unseen(observed, stars, groups, scratch):  # type: ignore[no-untyped-def]
-    """The most that all hypotheses can weigh that have at most one star of each group.
+    """An upper bound on the total weight of hypotheses with at most one star of each group.
 
-    Each holds a candidate of a pair across groups, either way round; a third
-    star that it predicts is rarely more than one.
+    Each of them contains a candidate of a pair across groups, in either order; it rarely predicts
+    more than one third star.
     """
     group, first_pair, last_pair = scratch.group, scratch.first_pair, scratch.last_pair
     s = len(group)
@@ -146,11 +143,11 @@ def _most_unseen(observed, stars, groups, scratch):  # type: ignore[no-untyped-d
 
 @njit_no_refcount
 def _choose_seeds(observed, stars, seeds):  # type: ignore[no-untyped-def]
-    """The stars whose pairs are scanned: all, or the brightest; those without a magnitude last.
+    """The stars whose pairs are scanned: all, or the brightest; unknown magnitudes last.
 
-    Stars that the presumed attitude puts outside the zone come after all others: nothing in the
-    zone matches them.  By insertion: to compile numba's sorts took longer than the rest of this
-    module.
+    Stars outside of the zone by the presumed attitude come after all others, since no zone star
+    matches them. Sorted by insertion, because numba's sorts take longer to compile than the rest of
+    this module.
     """
     magnitude, direction = observed.magnitude, observed.direction
     chosen = first = 0
@@ -176,13 +173,13 @@ def _choose_seeds(observed, stars, seeds):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def _is_brighter(one, other):  # type: ignore[no-untyped-def]
-    """True if one magnitude comes before another; NaN comes last."""
+    """True if one magnitude is brighter than another; NaN counts as faintest."""
     return one < other or (math.isnan(other) and not math.isnan(one))
 
 
 @njit_no_refcount
 def _insert(seeds, last, at, k):  # type: ignore[no-untyped-def]
-    """Put a star at a place; those from there to before `last` move on by one."""
+    """Insert a star into a list at an index, moving later entries up to `last` by one."""
     for x in range(last, at, -1):
         seeds[x] = seeds[x - 1]
     seeds[at] = k
@@ -190,7 +187,7 @@ def _insert(seeds, last, at, k):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def _find_candidates(observed, pairs, scratch):  # type: ignore[no-untyped-def]
-    """Per pair of seeds the range of candidate pairs by separation, and the separation."""
+    """For each pair of seeds: the separation, and the range of catalog pairs within tolerance."""
     seeds, direction, sigma_rad = scratch.seeds, observed.direction, observed.sigma_rad
     s = len(seeds)
     for x in range(s):
@@ -205,7 +202,7 @@ def _find_candidates(observed, pairs, scratch):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def _first_at(angle, pairs):  # type: ignore[no-untyped-def]
-    """The first pair not closer than an angle."""
+    """The index of the first pair in the zone's index with at least a given separation."""
     k = min(max(int(angle * pairs.bins_per_rad), 0), len(pairs.bin_start) - 1)
     at = pairs.bin_start[k]
     while at > 0 and pairs.separation[at - 1] >= angle:
@@ -217,9 +214,9 @@ def _first_at(angle, pairs):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def _cheapest(scratch):  # type: ignore[no-untyped-def]
-    """The two groups whose cross pairs cost least to scan.
+    """The two groups of stars whose cross pairs cost least to scan.
 
-    Short pairs predict badly and cost more than their number.
+    Short pairs predict inaccurately and cost more than their number of candidates.
     """
     group, separation, cost = scratch.group, scratch.separation, scratch.cost
     first, last = scratch.first_pair, scratch.last_pair
@@ -244,7 +241,7 @@ def _cheapest(scratch):  # type: ignore[no-untyped-def]
 
 
 class ObservedPair(NamedTuple):
-    """Observed stars i and j, and the range of candidate pairs by their separation."""
+    """A pair of observed stars i and j, and the range of candidate pairs by their separation."""
 
     i: Any
     j: Any
@@ -254,7 +251,7 @@ class ObservedPair(NamedTuple):
 
 @njit_no_refcount
 def weigh_pairs(observed, stars, pairs, scratch, ledger, progress):  # type: ignore[no-untyped-def]
-    """Weigh the hypotheses of two stars alone; the progress, and whether it was bounded."""
+    """Weigh the hypotheses of only two stars; returns the progress, and true if cut short."""
     seeds = scratch.seeds
     s = len(seeds)
     top = progress.unexplored_weight
@@ -275,7 +272,9 @@ def weigh_pairs(observed, stars, pairs, scratch, ledger, progress):  # type: ign
 
 @njit_no_refcount
 def _weigh_pair(observed, stars, pairs, pair, scratch, ledger, progress, top):  # type: ignore[no-untyped-def]
-    """Weigh the candidates of one observed pair; the progress, and the heaviest of all."""
+    """Weigh the candidates of one observed pair; returns the progress and the largest log
+    weight.
+    """
     i, j, kind = pair.i, pair.j, observed.prior_kind
     sine = math.sin(separation_rad(observed.direction[i], observed.direction[j]))
     if sine <= 0.0:
@@ -285,7 +284,7 @@ def _weigh_pair(observed, stars, pairs, pair, scratch, ledger, progress, top):  
     for k in (i, j):
         if not np.isnan(observed.magnitude[k]):
             compared += 1
-    # At no shift; that of a candidate takes the prior's place.
+    # The bound assumes no error of the prior; a candidate's own prior replaces it.
     bound = (
         log_weight_bound(observed, stars, 2, compared)
         - evidence.LOG_PRIOR_AT_BEST[kind]
@@ -331,7 +330,7 @@ def _weigh_pair(observed, stars, pairs, pair, scratch, ledger, progress, top):  
 
 @njit_no_refcount
 def _shift(observed, stars, pair, polar_i, polar_j, a, b):  # type: ignore[no-untyped-def]
-    """The least angle by which the prior is off where the observed pair is stars a and b.
+    """The least error of the a priori attitude if the observed pair is zone stars a and b.
 
     `polar_i` and `polar_j` are the angles of the observed stars to the presumed axis.
     """
@@ -349,7 +348,7 @@ def _shift(observed, stars, pair, polar_i, polar_j, a, b):  # type: ignore[no-un
 
 @njit_no_refcount
 def _farthest(least, kind):  # type: ignore[no-untyped-def]
-    """The largest angle, to a thousandth, at which the prior's logarithm reaches so much."""
+    """The largest angle, to a thousandth, at which the log prior density reaches a bound."""
     low, high = 0.0, math.pi
     if evidence.log_prior(high, kind) >= least:
         return high

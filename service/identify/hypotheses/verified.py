@@ -1,8 +1,8 @@
-"""The identifier `verified`: a probability for every star, from all that is known of all of them.
+"""The identifier `verified`: a posterior probability for the identity of every star.
 
-Hypotheses are searched for without the tests of steps 1 to 10 and weighed as a
-posterior (`search`, `evidence`); a star is unique from a probability of
-0.999.  STARID's votes are counted beside it and shown.
+Hypotheses are searched without the tests of steps 1 to 10 and weighed by their posterior (`search`,
+`evidence`); a star is unique from a probability of 0.999. STARID's votes are counted too, for
+information.
 """
 
 import numpy as np
@@ -39,21 +39,21 @@ def identify_verified(
     found: IdentifiedColumns,
     exhaustive: bool = False,
 ) -> None:
-    """Identify stars by the posterior of hypotheses.
+    """Identify the stars of sightings by the posterior of hypotheses, into `found`.
 
-    Of many sightings, `which` names the rows of those that the zone serves.  `exhaustive`: go on
-    after a hypothesis that outweighs chance.
+    `which` has the row numbers of the sightings that the zone serves. With `exhaustive` the search
+    continues after a hypothesis that outweighs chance.
     """
-    # The votes first, which cost least.
+    # The votes are counted first because they cost least.
     identify_by_votes(which, seen, zone, rules, found)
     weigh_sightings(which, seen, zone.arrays, zone.star, exhaustive, found)
 
 
 @njit(nogil=True)
 def weigh_sightings(which, seen, zone, star_of, exhaustive, found):  # type: ignore[no-untyped-def]
-    """Weigh the hypotheses of those of many sightings that a zone serves, after their votes.
+    """Weigh the hypotheses of the sightings that a zone serves, after their votes were counted.
 
-    `which` are their rows in the columns `seen` and `found`.
+    `which` are the sightings' rows in the columns `seen` and `found`.
     """
     for s in which:
         first, last = seen.offsets[s], seen.offsets[s + 1]
@@ -83,12 +83,12 @@ def weigh_sightings(which, seen, zone, star_of, exhaustive, found):  # type: ign
 
 @njit_no_refcount
 def _name(k, at, posterior, star_of, found):  # type: ignore[no-untyped-def]
-    """Name star k of a posterior, which is row `at` of the columns; whether its rivals are cut."""
+    """Record the identity of star k of a posterior in row `at`; true if its rivals are cut."""
     row, chance, none = posterior.star[k], posterior.probability[k], posterior.none[k]
     rivals, explained = found.rivals[at], found.hypothesis[at]
     found.hypothesis[at] = star_of[explained] if explained >= 0 else -1
     if chance >= UNIQUE_PROBABILITY:
-        # Of a unique star the others are too unlikely to matter.
+        # The rivals of a unique star are too unlikely to list.
         found.outcome[at], found.star[at], found.probability[at] = _UNIQUE, star_of[row], chance
         rivals[:] = -1
         return False
@@ -103,7 +103,7 @@ def _name(k, at, posterior, star_of, found):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def _weigh(sighted, zone, bounds, exhaustive, max_work, posterior):  # type: ignore[no-untyped-def]
-    """Search and marginals of a scene; whether it was bounded, whether mirrored, and the work."""
+    """Search and sum hypotheses; returns if it was cut short, if mirrored, and the work."""
     n = len(sighted.direction)
     observed, stars, pairs = scene_in(sighted, zone, bounds)
     scratch, ledger = scratch_for(n), ledger_for(n)

@@ -1,1 +1,1 @@
-"""Lost in space: which stars these are, and where that points, with nothing known before."""
+"""The lost-in-space solver: stars and attitude identified without any prior knowledge."""

@@ -1,4 +1,4 @@
-"""The decision from the weighed attitudes: an answer or a refusal, and a probability per point."""
+"""The decision over weighed attitudes: acceptance or refusal, and a probability for each point."""
 
 import math
 
@@ -11,17 +11,19 @@ from service.identify.lost_in_space.matching import LARGEST_GATE_RAD, nearest_st
 from service.identify.lost_in_space.search import SAME_ATTITUDE_RAD
 
 LARGEST_SIGMA_RAD = math.radians(0.25)
-"""About its worst axis, for which an attitude is not told: a cluster in a corner fixes no roll."""
+"""Largest sigma of an accepted attitude about its worst axis (a corner cluster gives no roll)."""
 
 LEAST = 1e-300
-"""Odds longer than this are told as this: a rich field's evidence is beyond every exponent."""
+"""Lower bound on probabilities relative to the best attitude, since evidence may exceed
+exponents.
+"""
 
 FOUND, TOO_FEW, NOTHING, DOUBTFUL, DEGENERATE = 0, 1, 2, 3, 4
 
 
 @njit(nogil=True)
 def decide(ledger, count):  # type: ignore[no-untyped-def]
-    """The heaviest match, the log odds of its attitude against all else, and the decision."""
+    """The heaviest match of the ledger, the log odds of its attitude, and the decision code."""
     weights, attitudes, covariances = ledger.weight, ledger.attitude, ledger.covariance
     if count == 0:
         return -1, -math.inf, NOTHING
@@ -32,7 +34,7 @@ def decide(ledger, count):  # type: ignore[no-untyped-def]
     same, others = 0.0, max(math.exp(posterior.LOG_NULL - weights[best]), LEAST)
     for h in range(count):
         share = math.exp(weights[h] - weights[best])
-        # The trace of the turn between two attitudes: 1 + 2 cos.
+        # The trace of the rotation between two attitudes is 1 + 2 cos of its angle.
         trace = 0.0
         for i in range(3):
             for j in range(3):
@@ -55,11 +57,12 @@ def decide(ledger, count):  # type: ignore[no-untyped-def]
 def star_probabilities(  # type: ignore[no-untyped-def]
     points, index, field, magnitude_gate, t, covariance, match, doubt
 ):
-    """For each point: its likeliest star, that one's probability, that of none, the second star.
+    """For each point: its most likely star, the probabilities of that and of no star, the second
+    star.
 
-    A point may be its match, the second star near its place, or clutter, which
-    is as dense as the points left unexplained.  `doubt` is the probability that
-    the attitude is another; it takes its share of every star.
+    A point may be its match, the second star near its place, or clutter with the density of the
+    unexplained points. `doubt` is the probability that the attitude is wrong, which reduces every
+    star's probability.
     """
     n = len(match)
     star, rival = np.full(n, -1, np.int64), np.full(n, -1, np.int64)

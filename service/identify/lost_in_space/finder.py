@@ -1,7 +1,7 @@
-"""The attitude of a batch of which nothing is known, from one of its trackers.
+"""The search of the whole sky for the attitude of a batch, using one of its trackers.
 
-It takes the place of the a priori attitude that was not given, or was wrong: zones,
-identities and the solution then follow as always.
+The attitude found replaces an a priori attitude that is missing or wrong: zones, identities and the
+solution then follow as usual.
 """
 
 import math
@@ -24,29 +24,28 @@ from service.sky.whole_sky.index import SkyIndex
 from service.vectors import ARCSEC_PER_RADIAN, Matrix, Vector, read_only
 
 SIGMA_FLOOR_ARCSEC = 1.5
-"""No star is taken as better known: a run catalog serves a year, and parallax is left out."""
+"""Least position sigma of a star in arcsec: the run catalog serves a year and has no parallaxes."""
 AT_REST = np.zeros(3)
 COLOR_SIGMA_MAG = 0.3
-"""What a magnitude is off by beside its noise: colour, and stars that vary."""
+"""Magnitude error beside the noise, from colours and variable stars."""
 FEW_MATCHES, LARGEST_SCATTER_MAG = 4, 1.0
-"""Up to so many matches without magnitudes, their offsets of magnitude scatter by less.
+"""For up to this number of matches made without magnitudes, largest scatter of their magnitude
+offsets.
 
-Otherwise chance gives three random points an attitude in 1 of 15,000 batches.  It is twice the
-noise of a tracker with poor photometry: half as much refuses real fields of four stars.
+Otherwise chance gives three random points an attitude in 1 of 15,000 batches. The limit is twice
+the noise of a tracker with poor photometry: half of it would refuse real fields of four stars.
 """
 
 
 @dataclass(frozen=True)
 class FoundAttitude:
-    """An attitude (3, 3), inertial to body, or why there is none.
+    """The attitude (3, 3) found for a batch, inertial to body, or the reason for a refusal.
 
-    `bounded`: a search ended at its bound on the work.  `explained` (n,) of every
-    tracker marks the stars of the likeliest attitude, also of one that is
-    refused.  `corrected` is what the
-    stars are to be identified from about the attitude: the observations, without
-    their magnitudes where the attitude was found without them; `warnings` then
-    says so.  `star` (n,) of every tracker are the rows of the run catalog that the
-    attitude was found with, -1 for the others, and `probability` that they are right.
+    `bounded`: a search ended at its work limit. `explained` (n,) marks, for every tracker, the
+    stars that the most likely attitude explains, even if refused. `corrected` has the observations
+    for identification about the attitude, without magnitudes if the attitude was found without
+    them; `warnings` then says so. `star` (n,) has, for every tracker, the run catalog rows used for
+    the attitude, -1 for other stars, and `probability` is that of the attitude.
     """
 
     attitude: Matrix | None
@@ -60,9 +59,9 @@ class FoundAttitude:
 
 
 class SkySearch(NamedTuple):
-    """The result of a search of the whole sky.
+    """The result of one search of the whole sky.
 
-    `magnitudes_used` is false where it succeeded only without the magnitudes.
+    `magnitudes_used` is false if the search succeeded only without magnitudes.
     """
 
     result: LostInSpaceResult
@@ -78,9 +77,9 @@ def find_attitude(
     sky: SkyModel,
     budget: WorkBudget,
 ) -> FoundAttitude:
-    """Search the whole sky, tracker by tracker, the one with the most stars first.
+    """Search the whole sky with one tracker after another, the one with the most stars first.
 
-    The refusal is that of the tracker with the most stars.
+    If no search succeeds, the refusal is that of the tracker with the most stars.
     """
     refusals: list[NoAttitude | None] = []
     explained = [np.zeros(len(each.magnitude_mag), np.bool_) for each in corrected]
@@ -102,7 +101,7 @@ def find_attitude(
         explained[place] = search.result.star >= 0
         if search.result.attitude is not None:
             attitude = tracker.body_from_tracker @ search.result.attitude
-            # The index has stars beyond the run catalog's limit, behind those within it.
+            # The index also has stars fainter than the run catalog's limit, after the others.
             known = search.result.star < len(run_catalog)
             rows = [np.full(len(one.magnitude_mag), -1) for one in corrected]
             rows[place] = np.where(known, search.result.star, -1)
@@ -137,10 +136,10 @@ def search_sky(
     velocity_c: Vector = AT_REST,
     budget: WorkBudget | None = None,
 ) -> SkySearch:
-    """Search the whole sky, and again without the magnitudes where that finds nothing.
+    """Search the whole sky, and repeat without magnitudes if that finds nothing.
 
-    Magnitudes without a zero point, or with one that is off by a magnitude or
-    more, refuse every match.  The refusal is that of the first search.
+    Magnitudes without a zero point, or with one that is off by a magnitude or more, would refuse
+    every match. The reported refusal is that of the first search.
     """
     budget = budget or WorkBudget()
 
@@ -168,13 +167,13 @@ def search_sky(
 def magnitude_offset(
     result: LostInSpaceResult, magnitude_mag: Vector, index: SkyIndex
 ) -> float | None:
-    """The median of observed minus catalog magnitude of the matched stars; None without any."""
+    """The median of observed minus catalog magnitude over matched stars; None without any."""
     off_mag = _magnitude_offsets(result, magnitude_mag, index)
     return float(np.median(off_mag)) if len(off_mag) else None
 
 
 def _magnitude_offsets(result: LostInSpaceResult, magnitude_mag: Vector, index: SkyIndex) -> Vector:
-    """Observed minus catalog magnitude of the matched stars that have one."""
+    """Observed minus catalog magnitudes of the matched stars that have a magnitude."""
     matched = (result.star >= 0) & ~np.isnan(magnitude_mag)
     return np.asarray(magnitude_mag[matched] - index.arrays.stars[result.star[matched], 3])
 
@@ -182,16 +181,19 @@ def _magnitude_offsets(result: LostInSpaceResult, magnitude_mag: Vector, index: 
 def _without_magnitudes(
     corrected: Sequence[CorrectedObservations],
 ) -> tuple[CorrectedObservations, ...]:
-    """Corrected observations of all trackers; trackers may share a magnitude offset."""
+    """Corrected observations of all trackers without magnitudes; trackers may share their
+    offset.
+    """
     return tuple(
-        # Locked, as those of a batch are: for others numba would compile every kernel anew.
+        # Read-only, as a batch's arrays are: for writable ones numba would compile every kernel
+        # again.
         replace(each, magnitude_mag=read_only(np.full(len(each.magnitude_mag), math.nan)))
         for each in corrected
     )
 
 
 def field_of(tracker: Tracker) -> FieldOfView:
-    """The circle that a tracker sees, and its photometry."""
+    """The circular field of view of a tracker, and its photometric error."""
     return FieldOfView(
         tracker.field_of_view_radius_deg,
         magnitude_sigma_mag=float(np.hypot(tracker.magnitude_sigma_mag, COLOR_SIGMA_MAG)),

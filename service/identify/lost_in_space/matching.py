@@ -1,4 +1,4 @@
-"""An attitude and the points that it explains: matched, fitted and matched again until stable."""
+"""Refinement of an attitude: points are matched to stars and fitted until the match is stable."""
 
 import math
 
@@ -13,25 +13,26 @@ from service.sky.geometry.star_grid import CELL
 from service.sky.whole_sky.index import patch_of
 
 MATCH_GATE = 4.5
-"""In sigmas of a point's own noise and of the attitude at its place."""
+"""Largest distance of a star from a point, in sigmas of the point's noise and the attitude's
+error.
+"""
 LARGEST_GATE_RAD = 0.006
 ROUNDS = 5
 REJECT_LOG = -4.0
-"""Log evidence of the points alone, before the last fit, that no further fit makes good."""
+"""Log evidence of the points, before the last fit, below which a candidate is dropped."""
 EDGE = 0.985
-"""A star is expected in the field only within this share of its half widths."""
+"""Share of the field's half widths within which a star is expected to be seen."""
 
 
 @njit(nogil=True, error_model="numpy", forceinline=True)
 def nearest_stars(  # type: ignore[no-untyped-def]
     cell_place, faces, cell_start, cell_rows, x, y, z, gate, brightest, faintest
 ):
-    """The two stars nearest to a direction of length one, within a gate and two magnitudes.
+    """The two stars nearest to a unit direction, within a gate and between two magnitudes.
 
-    The arrays are those of the index, one by one: to pass all of them
-    costs more than the look-up.
+    The index arrays are passed one by one, since passing their tuple costs more than the look-up.
 
-    Returns the rows, -1 where there is none, and the nearer one's chord^2.
+    Returns the stars' rows, -1 for none, and the nearer one's squared chord.
     """
     ax, ay, az = abs(x), abs(y), abs(z)
     if ax >= ay and ax >= az:
@@ -42,7 +43,7 @@ def nearest_stars(  # type: ignore[no-untyped-def]
         face, u, v, depth = (4 if z > 0.0 else 5), x, y, az
     u /= depth
     v /= depth
-    # As `star_grid.cells_about`: the projection stretches an angle by at most 1 + u^2 + v^2.
+    # As in `star_grid.cells_about`: the projection stretches an angle by at most 1 + u^2 + v^2.
     reach = gate * (1.0 + u * u + v * v)
     low_u, low_v = faces[face, 0], faces[face, 1]
     size_u, size_v = faces[face, 2], faces[face, 3]
@@ -61,7 +62,7 @@ def nearest_stars(  # type: ignore[no-untyped-def]
             chord2 = dx * dx + dy * dy + dz * dz
             if chord2 >= second:
                 continue
-            # Written so that an unknown magnitude passes.
+            # The comparison lets unknown magnitudes (NaN) pass.
             if cell_place[at, 3] < brightest or cell_place[at, 3] > faintest:
                 continue
             row = np.int64(cell_rows[at])
@@ -75,16 +76,18 @@ def nearest_stars(  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def faintest_star(limit_mag, magnitude, gate):  # type: ignore[no-untyped-def]
-    """How faint a point's star may be; of unknown magnitude none beyond the limit of pairs."""
+    """Faintest star that can match a point; the limit of the pairs where its magnitude is
+    unknown.
+    """
     return limit_mag if np.isnan(magnitude) else magnitude + gate
 
 
 @njit(nogil=True, error_model="numpy", forceinline=True)
 def gauss_newton_step(points, stars, candidate):  # type: ignore[no-untyped-def]
-    """One Gauss-Newton step of T towards the matched stars.
+    """One Gauss-Newton step of an attitude T towards its matched stars.
 
-    Returns chi^2 before the step and ln det N, the latter -inf where the
-    geometry gives no attitude.  The covariance becomes that of the fit, radians^2.
+    Returns chi^2 before the step and ln det N, the latter -inf where the geometry gives no
+    attitude. The candidate's covariance becomes that of the fit, radians^2.
     """
     match, t, matrix, inverse = candidate.match, candidate.t, candidate.matrix, candidate.covariance
     m00 = m11 = m22 = m01 = m02 = m12 = 0.0
@@ -132,7 +135,7 @@ def gauss_newton_step(points, stars, candidate):  # type: ignore[no-untyped-def]
     e0 = inverse[0, 0] * g0 + inverse[0, 1] * g1 + inverse[0, 2] * g2
     e1 = inverse[1, 0] * g0 + inverse[1, 1] * g1 + inverse[1, 2] * g2
     e2 = inverse[2, 0] * g0 + inverse[2, 1] * g1 + inverse[2, 2] * g2
-    # What the step takes away from chi^2.
+    # The decrease of chi^2 by the step.
     chi2 -= e0 * g0 + e1 * g1 + e2 * g2
     turn(t, e0, e1, e2)
     return max(chi2, 0.0), math.log(det)
@@ -140,7 +143,7 @@ def gauss_newton_step(points, stars, candidate):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, error_model="numpy", forceinline=True)
 def match_at(points, index, magnitude_gate, candidate):  # type: ignore[no-untyped-def]
-    """Match every point at an attitude known to a covariance; how many, and whether any changed."""
+    """Match every point at an attitude with covariance; returns the number, true if any changed."""
     faces, cell_place = index.face, index.cell_place
     cell_start, cell_rows = index.cell_start, index.cell_rows
     limit_mag = index.class_edge[-1, 0]
@@ -154,7 +157,7 @@ def match_at(points, index, magnitude_gate, candidate):  # type: ignore[no-untyp
         y = t[0, 1] * b0 + t[1, 1] * b1 + t[2, 1] * b2 - velocity[1]
         z = t[0, 2] * b0 + t[1, 2] * b1 + t[2, 2] * b2 - velocity[2]
         norm = 1.0 / math.sqrt(x * x + y * y + z * z)
-        # What the attitude's error moves here: trace of [b x] P [b x]^T, over two axes, at worst.
+        # The attitude's error at this place: trace of [b x] P [b x]^T over two axes, at worst.
         spread = trace - (p[0, 0] * b0 * b0 + p[1, 1] * b1 * b1 + p[2, 2] * b2 * b2)
         spread -= 2.0 * (p[0, 1] * b0 * b1 + p[0, 2] * b0 * b2 + p[1, 2] * b1 * b2)
         gate = MATCH_GATE * math.sqrt(sigma[k] * sigma[k] + spread)
@@ -169,7 +172,7 @@ def match_at(points, index, magnitude_gate, candidate):  # type: ignore[no-untyp
             near[k] = chord2 / (gate * gate)
         for other in range(k):
             if row >= 0 and match[other] == row:
-                # One star is one point: the nearer one.
+                # A star matches one point only: the nearer one.
                 if near[other] <= near[k]:
                     row = -1
                 else:
@@ -186,10 +189,10 @@ def match_at(points, index, magnitude_gate, candidate):  # type: ignore[no-untyp
 
 @njit(nogil=True, error_model="numpy")
 def refine(points, index, field, magnitude_gate, candidate):  # type: ignore[no-untyped-def]
-    """Fit to the present match, then match and fit until nothing changes.
+    """Fit an attitude to its match, then match and fit again until nothing changes.
 
-    Returns the number of stars and the log evidence, -inf where there is no
-    attitude; `candidate` gets the result.
+    Returns the number of matched stars and the log evidence, -inf if there is no attitude;
+    `candidate` gets the result.
     """
     chi2, log_det = gauss_newton_step(points, index.stars, candidate)
     if log_det == -math.inf:
@@ -215,9 +218,9 @@ def refine(points, index, field, magnitude_gate, candidate):  # type: ignore[no-
 
 @njit(nogil=True, error_model="numpy", forceinline=True)
 def points_alone(points, stars, field, match, matched, chi2, log_det):  # type: ignore[no-untyped-def]
-    """The evidence without what stars are missing, which can only be less.
+    """The log evidence of an attitude without the missing stars, which can only reduce it.
 
-    Also the number of magnitudes compared and the faintest star matched.
+    Also returns the number of compared magnitudes and the faintest matched star.
     """
     n = len(match)
     log_spots = total = square = any_magnitude = 0.0
@@ -231,7 +234,7 @@ def points_alone(points, stars, field, match, matched, chi2, log_det):  # type: 
         row = match[k]
         if row < 0:
             continue
-        # Most often all are known alike.
+        # Usually all points have the same sigma.
         if points.sigma[k] != sigma:
             sigma = points.sigma[k]
             log_spot = math.log(field.area / (2.0 * math.pi * sigma * sigma))
@@ -254,9 +257,9 @@ def points_alone(points, stars, field, match, matched, chi2, log_det):  # type: 
 
 @njit(nogil=True, error_model="numpy", forceinline=True)
 def stars_inside(place, patch_rows, at, end, reach, t, field, inside):  # type: ignore[no-untyped-def]
-    """The next stars of a patch within the field, as many as fit, and where to go on.
+    """Next stars of a patch inside the field, as many as fit in a buffer, and where to continue.
 
-    Without a branch on what was read, so that one look at memory need not wait for another.
+    Written without branches on the data, so that memory accesses do not wait for each other.
     """
     x0, x1, x2 = np.float32(t[0, 0]), np.float32(t[0, 1]), np.float32(t[0, 2])
     y0, y1, y2 = np.float32(t[1, 0]), np.float32(t[1, 1]), np.float32(t[1, 2])
@@ -283,9 +286,9 @@ def stars_inside(place, patch_rows, at, end, reach, t, field, inside):  # type: 
 
 @njit(nogil=True, error_model="numpy", forceinline=True)
 def evidence(points, index, field, candidate, matched, chi2, log_det):  # type: ignore[no-untyped-def]
-    """The log weight of a fitted match against all points being clutter; see `posterior`.
+    """The log evidence of a fitted match against all points being clutter; see `posterior`.
 
-    Exact where it is above zero; below, the search for missing stars may end early.
+    The value is exact if positive; otherwise the search for missing stars may end early.
     """
     match, t = candidate.match, candidate.t
     weight, compared, faintest = points_alone(
@@ -295,9 +298,9 @@ def evidence(points, index, field, candidate, matched, chi2, log_det):  # type: 
         return weight
     n = len(match)
     place, patch_rows, inside = index.place, index.patch_rows, candidate.inside
-    # As the magnitudes it is held against.
+    # Single precision, as the magnitudes that it is compared with.
     faintest = np.float32(faintest)
-    # The field: stars that should be seen, in order of brightness.
+    # The stars that the field should show, in order of brightness.
     limit = field.limit_mag
     if np.isnan(limit):
         limit = -math.inf

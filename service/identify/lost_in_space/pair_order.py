@@ -1,4 +1,4 @@
-"""Which pair of points to look up first: bright ones with few candidates and a good lever."""
+"""Order in which point pairs are looked up: bright ones with few candidates and a long baseline."""
 
 import math
 
@@ -10,43 +10,45 @@ from service.identify.lost_in_space.predictors import GATE, SLACK_RAD
 from service.sky.whole_sky.index import BRIGHTEST_MAG, BUCKET_RAD, STEP_MAG
 
 LEAST_PAIR_RAD = 0.006
-"""A shorter pair fixes the turn about itself too poorly to predict anything."""
+"""Least separation of a pair of points; a shorter one fixes the rotation about itself too
+poorly.
+"""
 TYPICAL_REACH_RAD = 0.07
 """Typical distance of the other points of a field from a pair."""
 CHORD_OF_LONGEST = 0.999
-"""The chord of 8 degrees over its arc, less a little."""
+"""Ratio of the chord to the arc of 8 degrees, rounded down."""
 CELL_RAD = 2.5e-3
-"""What a bitmap's cell adds to the place of a star."""
+"""Error of a star's place from the cell size of a bitmap."""
 EXACT_COST = 2.0
 """Cost of comparing a candidate with the exact place of one more point, in candidates."""
 PRIOR_COST = 40.0
 """Fixed cost of trying a pair, in units of one candidate."""
 RANK_COST = 0.15
-"""A pair of fainter points is less sure to be two stars of the index."""
+"""Increase of a pair's cost per rank: fainter points are less likely to be stars of the index."""
 USE_COST = 3.0
-"""Each failed try of a point makes it this much less attractive."""
+"""Factor on a point's cost after each failed try."""
 MOST_BEYOND = 0.9
 """Bound on the probability that a point is too faint; below 1: magnitudes may share an offset."""
 SURELY_WITHIN = 5.0
-"""Sigmas by which a point is brighter than the limit, so that it is none from beyond."""
+"""Sigmas above the limit from which a point is surely no star beyond the limit."""
 NO_ROW = 1 << 16
-"""More than there are rows."""
+"""A row number larger than any in the index."""
 MAGNITUDE_GATE = 3.3
-"""In sigmas of magnitude."""
+"""Largest difference of a point's and a star's magnitude, in sigmas."""
 OFFSET_ALLOWED_MAG = 0.15
 
 
 @njit(nogil=True)
 def magnitude_gate(sigma_mag):  # type: ignore[no-untyped-def]
-    """How far a point's magnitude may be from its star's."""
+    """The largest difference between the magnitudes of a point and its star."""
     return MAGNITUDE_GATE * math.hypot(sigma_mag, OFFSET_ALLOWED_MAG)
 
 
 @njit(nogil=True)
 def rows_of_magnitude(brighter, magnitude, gate):  # type: ignore[no-untyped-def]
-    """First row and the one past the last of the stars that a point of this magnitude may be.
+    """The range of index rows (first, one past the last) of stars that a point's magnitude allows.
 
-    To the steps of the table `brighter`: a few more than within the gate.
+    The range is rounded to steps of the table `brighter`, so that it has a few stars more.
     """
     last = len(brighter) - 1
     if np.isnan(magnitude):
@@ -59,10 +61,10 @@ def rows_of_magnitude(brighter, magnitude, gate):  # type: ignore[no-untyped-def
 
 @njit(nogil=True, error_model="numpy")
 def describe_points(points, index, sigma_mag, gate, pairs):  # type: ignore[no-untyped-def]
-    """What every point brings to a pair, into `pairs`: its classes, and the chance to be beyond.
+    """Fill `pairs` with each point's range of pair classes, and its chance to be beyond the limit.
 
-    Noise shows more faint stars as bright than bright ones as faint, for there
-    are more of them: of a magnitude the likely truth is fainter.
+    Since faint stars are more numerous, noise makes more of them look bright than the reverse: the
+    likely true magnitude is fainter than the measured one.
     """
     limit = index.class_edge[-1, 0] - posterior.COUNT_SLOPE * sigma_mag * sigma_mag
     for k in range(len(points.magnitude)):
@@ -73,7 +75,7 @@ def describe_points(points, index, sigma_mag, gate, pairs):  # type: ignore[no-u
             pairs.share[k] -= index.class_edge[first - 1, 1]
         pairs.beyond[k] = 0.0
         brighter = (limit - points.magnitude[k]) / sigma_mag
-        # Not so where the magnitude is unknown.
+        # Does not apply to unknown magnitudes (NaN).
         if brighter < SURELY_WITHIN:
             chance = 0.5 * math.erfc(brighter * math.sqrt(0.5))
             pairs.beyond[k] = min(chance, MOST_BEYOND)
@@ -81,14 +83,14 @@ def describe_points(points, index, sigma_mag, gate, pairs):  # type: ignore[no-u
 
 @njit(nogil=True)
 def chord(a, b):  # type: ignore[no-untyped-def]
-    """The straight distance between two unit vectors."""
+    """The length of the chord between two unit vectors."""
     dx, dy, dz = a[0] - b[0], a[1] - b[1], a[2] - b[2]
     return math.sqrt(dx * dx + dy * dy + dz * dz)
 
 
 @njit(nogil=True, error_model="numpy")
 def buckets_of(points, index, i, j, gate):  # type: ignore[no-untyped-def]
-    """First and last bucket of separation that a pair's star pair may be in, by so many sigmas."""
+    """The range of separation buckets in the index for the stars of a pair of points."""
     apart = 2.0 * math.asin(min(1.0, 0.5 * chord(points.observed[i], points.observed[j])))
     variance = points.sigma[i] * points.sigma[i] + points.sigma[j] * points.sigma[j]
     tolerance = gate * math.sqrt(variance) + SLACK_RAD
@@ -101,7 +103,7 @@ def buckets_of(points, index, i, j, gate):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def classes_of(magnitude, class_edge, gate):  # type: ignore[no-untyped-def]
-    """First and last class of pairs with this magnitude the fainter; all where it is unknown."""
+    """The range of pair classes for a fainter star's magnitude; all if the magnitude is unknown."""
     classes = len(class_edge)
     if np.isnan(magnitude):
         return 0, classes - 1
@@ -116,11 +118,11 @@ def classes_of(magnitude, class_edge, gate):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, error_model="numpy")
 def pair_costs(points, index, first_fresh, count, pairs):  # type: ignore[no-untyped-def]
-    """What each pair of the first `count` points costs to try; infinite: not at all.
+    """Compute the cost of trying each pair of the first `count` points; infinite for useless pairs.
 
-    Pairs of the first `first_fresh` points keep what they have.  The number of
-    candidates is that of evenly spread stars.  Points are brightest first, those
-    of unknown magnitude last: the classes of a pair are those of its later point.
+    Costs among the first `first_fresh` points are left unchanged. The number of candidates is
+    estimated for uniformly distributed stars. Points are sorted brightest first, with unknown
+    magnitudes last, so that a pair's classes are those of its later point.
     """
     longest = (index.offset.shape[1] - 1) * BUCKET_RAD
     density = math.sqrt(len(index.pairs) / (1.0 - math.cos(longest))) / (2.0 * math.pi)
@@ -148,10 +150,10 @@ def pair_costs(points, index, first_fresh, count, pairs):  # type: ignore[no-unt
 
 @njit(nogil=True)
 def cheapest_pair(pairs, count, groups):  # type: ignore[no-untyped-def]
-    """The pair to try next, points tried in vain set back; (-1, -1) where none is left.
+    """The cheapest pair to try next, with failed points penalised; (-1, -1) if none is left.
 
-    Only pairs of one group: those whose ranks leave the same remainder.  With
-    no groups (0) only pairs of points that are not `covered` yet.
+    Only pairs within a group are considered, whose ranks have the same remainder. With no groups
+    (0) only pairs of points that are not `covered` yet are.
     """
     cost, used, covered = pairs.cost, pairs.used, pairs.covered
     left = right = -1

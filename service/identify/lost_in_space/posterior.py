@@ -1,4 +1,4 @@
-"""How much an attitude explains, against all points being clutter.
+"""The log evidence of an attitude, against the hypothesis that all points are clutter.
 
 In logarithms, for n matched of k points in a field of solid angle A:
 
@@ -21,28 +21,32 @@ from service.compiled.jit import njit
 from service.identify.hypotheses.evidence import log_sum
 
 DOUBT = 1e-4
-"""What all other explanations together may hold of the posterior."""
+"""Largest share of the posterior that all other explanations may have beside a reported
+attitude.
+"""
 LOG_NULL = -math.log(20.0)
-"""Prior log odds of a field without stars: points of a tracker that sees none are rare."""
+"""Prior log odds of a field without stars, which is rare."""
 LEAST_EVIDENCE = math.log(1.0 / DOUBT - 1.0) + LOG_NULL
-"""No attitude of less is ever reported."""
+"""Least log evidence of any reported attitude."""
 
 POSITION_SCALES = ((0.15, 0.5), (0.6, 1.0), (0.25, 2.0))
-"""Weights, and the factors by which the sigmas may be off."""
+"""Weights of the noise models, and their factors on the sigmas."""
 _LOG_SCALES = tuple((math.log(w), math.log(s), 0.5 / (s * s)) for w, s in POSITION_SCALES)
 CLEAN_CLUTTER = 0.3
-"""In a clean field each further point that is no star of the index is this likely."""
+"""Probability in a clean field that a further point is no star of the index."""
 DETECTED = 0.97
-"""A star well within the limit is seen in a clean field."""
+"""Probability in a clean field that a star well within the limit is detected."""
 OFFSET_SIGMA_MAG = 0.5
-"""The observed magnitudes may be off together by this."""
+"""Sigma of a common offset of all observed magnitudes."""
 COUNT_SLOPE = 0.5 * math.log(10.0)
-"""Stars become more numerous by 10^0.5 a magnitude."""
+"""Growth of the number of stars per magnitude: the logarithm of 10^0.5."""
 
 MISSING_REACH, MISSING_STEPS = 2.0, 16
-"""The table of missing stars: to so many sigmas on either side of the limit, steps a sigma."""
+"""Extent of the table of missing stars in sigmas on either side of the limit, and steps per
+sigma.
+"""
 FAINT_REACH = 1.0
-"""Stars fainter than the limit by more sigmas are seldom seen, and not looked for."""
+"""Sigmas by which a star is fainter than the limit from which the search leaves it out."""
 
 LOG_FACTORIAL = np.cumsum(np.log(np.maximum(np.arange(512), 1)))
 LOG_MISSING = np.array(
@@ -52,7 +56,7 @@ LOG_MISSING = np.array(
     ]
 )
 CROWDED = 2.3
-"""Some of the points may lie closer together than all, and their attitude be so much less known."""
+"""Allowance in ln det N for matched points that lie closer together than all points."""
 ALWAYS_ENOUGH = 4
 """Number of matched points from which a candidate is never ruled out beforehand."""
 _LOG_2PI = math.log(2.0 * math.pi)
@@ -61,7 +65,9 @@ _LOG_ROTATIONS = math.log(8.0 * math.pi**2)
 
 @njit(nogil=True)
 def log_positions(matched, log_area_per_spot, chi2, log_det):  # type: ignore[no-untyped-def]
-    """Positions and the volume of the attitude; `log_area_per_spot`: sum of ln(A/2 pi sigma^2)."""
+    """Log evidence of positions and attitude volume; `log_area_per_spot`: sum of ln(A/2 pi
+    sigma^2).
+    """
     most = -math.inf
     for log_weight, log_scale, half in _LOG_SCALES:
         most = max(most, log_weight + (3.0 - 2.0 * matched) * log_scale - half * chi2)
@@ -76,9 +82,9 @@ def log_positions(matched, log_area_per_spot, chi2, log_det):  # type: ignore[no
 
 @njit(nogil=True, error_model="numpy")
 def fewest_stars(points, area, sigma_mag):  # type: ignore[no-untyped-def]
-    """How many of the points must be matched to be evidence enough; more than all where none can.
+    """Least number of matched points that can be sufficient evidence; more than all if none can.
 
-    The evidence is that of a perfect match of the brightest, with no star missing.
+    The evidence is that of a perfect match of the brightest points, without a missing star.
     """
     n = len(points.observed)
     matrix = np.zeros((3, 3))
@@ -125,10 +131,10 @@ def fewest_stars(points, area, sigma_mag):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def log_labels(points, matched):  # type: ignore[no-untyped-def]
-    """Which of the points are stars, and that the others are clutter."""
+    """Log probability of which points are stars and which are clutter."""
     clutter = points - matched
     clean = math.log(1.0 - CLEAN_CLUTTER) + clutter * math.log(CLEAN_CLUTTER)
-    # Of all shares the greater ones are likelier: two stars more that all share it.
+    # The prior of the share of stars is Beta(3, 1), which favours large shares.
     any_number = math.log(
         3.0 * (matched + 1.0) * (matched + 2.0) / ((points + 1.0) * (points + 2.0) * (points + 3.0))
     )
@@ -139,7 +145,7 @@ def log_labels(points, matched):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def log_any_share(matched, expected):  # type: ignore[no-untyped-def]
-    """Log probability of the set of stars that are seen, if every share seen is equally likely."""
+    """Log probability of the set of detected stars if all detection rates are equally likely."""
     expected = min(expected, len(LOG_FACTORIAL) - 2)
     return LOG_FACTORIAL[matched] + LOG_FACTORIAL[expected - matched] - LOG_FACTORIAL[expected + 1]
 
@@ -153,7 +159,9 @@ def log_missing(brighter_by_sigma):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def log_magnitudes(compared, total, square, sigma_mag):  # type: ignore[no-untyped-def]
-    """The density of observed minus catalog magnitudes: their number, sum and sum of squares."""
+    """Log density of observed minus catalog magnitudes, from their number, sum and sum of
+    squares.
+    """
     if compared == 0:
         return 0.0
     common = OFFSET_SIGMA_MAG * OFFSET_SIGMA_MAG
@@ -168,5 +176,5 @@ def log_magnitudes(compared, total, square, sigma_mag):  # type: ignore[no-untyp
 
 @njit(nogil=True)
 def log_any_magnitude(magnitude, faintest):  # type: ignore[no-untyped-def]
-    """The density of the magnitude of any star or point that is no fainter than a bound."""
+    """Log density of the magnitude of a random star or point that is no fainter than a bound."""
     return math.log(COUNT_SLOPE) + COUNT_SLOPE * min(magnitude - faintest, 0.0)

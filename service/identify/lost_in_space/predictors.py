@@ -1,8 +1,8 @@
-"""From one pair of points the places of all others, without an attitude.
+"""Prediction of the places of all other points from one pair of points, without an attitude.
 
-Every other point is b_k = alpha b_i + beta b_j + gamma (b_i x b_j).  With the
-stars r_a and r_b in the place of i and j the same coefficients give its place
-in the sky.  Handedness is in gamma: a mirrored sky is never predicted.
+Every other point is b_k = alpha b_i + beta b_j + gamma (b_i x b_j). With stars r_a and r_b for i
+and j the same coefficients give the point's place in the sky. The sign of gamma excludes a mirrored
+sky.
 """
 
 import math
@@ -10,23 +10,25 @@ import math
 from service.compiled.jit import njit
 
 GATE = 3.6
-"""In sigmas: how far a star may lie from its prediction, and a pair from its separation."""
+"""Largest distance of a star from its prediction, and of a pair from its separation, in sigmas."""
 SLACK_RAD = 2e-5
-"""Aberration changes a separation of 8 degrees by as much as this, 4 arcsec."""
+"""Largest change of a separation of 8 degrees by aberration in radians, 4 arcsec."""
 RANK_WEIGHT = 0.04
-"""A faint point is less sure to be a star of the index: what each rank adds to its gate's cost."""
+"""Relative increase of a point's cost per rank: a faint point is less likely a star of the
+index.
+"""
 
 
 BEYOND, DEEP_COST = 0.02, 1.5
-"""A point likelier than this to be a star beyond the limit tells less: such stars are many."""
+"""Probability of lying beyond the limit from which a point is less useful; its cost factor."""
 
 
 @njit(nogil=True, error_model="numpy")
 def predict(points, beyond, i, j, largest, prefilter):  # type: ignore[no-untyped-def]
-    """Coefficients and gates of all points, and their order, the most telling first.
+    """Compute all points' prediction coefficients and gates, and sort points by information.
 
-    They go into `prefilter`.  `beyond` (n,): the chance of each to be a star beyond the limit.
-    Returns how many have a gate of at most `largest`.
+    The results go into `prefilter`. `beyond` (n,) is each point's probability to be a star beyond
+    the limit. Returns the number of points with a gate of at most `largest`.
     """
     observed, sigma = points.observed, points.sigma
     coefficients, gate, order, cost = (

@@ -1,8 +1,8 @@
-"""Candidates for a pair of points, rejected by bitmap: most of them within nanoseconds.
+"""Rejection of candidate star pairs by bitmaps of the sky, within nanoseconds for most.
 
-Star pairs of the right separation are taken from the index both ways round, a
-chunk at a time, and a further point's place is worked out for all of them at
-once; for those that are left the places of all further points at once.
+Star pairs of the right separation are read from the index in both orders, a chunk at a time. First
+one further point's place is predicted for all of them at once; then, for the remaining pairs, the
+places of all further points at once.
 """
 
 import numpy as np
@@ -16,10 +16,10 @@ from service.sky.whole_sky.index import BITMAP_RADII_RAD
 
 @njit(nogil=True)
 def ranked(prefilter, beyond, prefiltered):  # type: ignore[no-untyped-def]
-    """By rank the coefficients in single precision, and the bitmap to ask.
+    """Sort prediction coefficients by rank, in single precision, with the bitmap for each point.
 
-    That is the least that no star within a gate escapes, one of all stars where
-    the point may be a star beyond the limit.
+    The bitmap is the finest that covers the point's gate; a point that may be a star beyond the
+    limit uses the bitmap of all stars.
     """
     for s in range(prefiltered):
         k = prefilter.order[s]
@@ -35,10 +35,10 @@ def ranked(prefilter, beyond, prefiltered):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, error_model="numpy")
 def pairs_of(pairs, place, at, count, rows_i, rows_j, chunk):  # type: ignore[no-untyped-def]
-    """Make the next `count` pairs ready to be sieved; how many candidates they are.
+    """Prepare the next `count` star pairs for the prefilter; returns the number of candidates.
 
-    A star for point i has its row in `rows_i`, (first, one past the last), and
-    one for point j in `rows_j`.  Without a branch, so that many are done at a time.
+    Stars for point i are in the row range `rows_i` (first, one past the last), those for point j in
+    `rows_j`. Written without branches, so that it is vectorised.
     """
     first_i, last_i = np.int32(rows_i[0]), np.int32(rows_i[1])
     first_j, last_j = np.int32(rows_j[0]), np.int32(rows_j[1])
@@ -57,9 +57,9 @@ def pairs_of(pairs, place, at, count, rows_i, rows_j, chunk):  # type: ignore[no
 
 @njit(nogil=True)
 def possible_of(bits, count, asked, prefilter, chunk):  # type: ignore[no-untyped-def]
-    """How many candidates of a chunk have a star near the place of a point that is asked first.
+    """The number of candidates in a chunk with a star near the predicted place of the first points.
 
-    Their numbers go to `chunk.possible`: twice the pair's, one more for a pair turned round.
+    Their numbers go to `chunk.possible`: twice the pair's index, plus one for the reversed order.
     """
     possible, cell, seen, allowed = chunk.possible, chunk.cell, chunk.seen, chunk.allowed
     for q in range(count):
@@ -88,12 +88,12 @@ def possible_of(bits, count, asked, prefilter, chunk):  # type: ignore[no-untype
 
 @njit(nogil=True)
 def stars_near(bits, prefilter, plan, place_a, place_b):  # type: ignore[no-untyped-def]
-    """Which points may have a star in their place where i and j are two stars: a bit a rank.
+    """A bit mask, by rank, of points that may have a star if points i and j are two given stars.
 
-    None where too few of those that are asked first have.
+    Zero if too few of the points that are checked first may have a star.
     """
     level, cell = prefilter.level, prefilter.cell
-    # All places, also those in vain: of a fixed number several are done at a time.
+    # Unused slots are computed too: a fixed count is vectorised.
     cells_of_points(RANKS, prefilter.single, place_a, place_b, cell)
     near = np.int64(0)
     for s in range(plan.prefiltered):

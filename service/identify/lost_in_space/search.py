@@ -1,8 +1,7 @@
-"""The search: pairs in the order of their cost, candidates filtered by bitmap and by exact place.
+"""The lost-in-space search: point pairs by cost, candidates filtered by bitmap and exact place.
 
-Those that survive are refined to an attitude and weighed.  The search ends with the
-first attitude that is beyond doubt, else when all pairs are tried or the bound
-on the work is reached.
+Surviving candidates are refined to an attitude and weighed. The search ends with the first attitude
+beyond doubt, when all pairs were tried, or at the work limit.
 """
 
 import math
@@ -41,45 +40,52 @@ from service.identify.lost_in_space.workspace import (
 from service.sky.whole_sky.index import BITMAP_RADII_RAD
 
 FIRST_POINTS = 7
-"""Brightest points that make the first pairs of a field of many; later pairs take `MOST_POINTS`."""
+"""Number of brightest points whose pairs come first in a rich field; later pairs take
+`MOST_POINTS`.
+"""
 FIRST_TRIES = 3
-"""Pairs tried for being cheap, before those that every attitude must have one of."""
+"""Number of pairs tried by cost alone, before the sets of which every attitude contains a pair."""
 NARROW_GATE, NARROW_MAG = 2.8, 0.75
-"""First tries look less far: sigmas of a separation, and a share of the gate of magnitudes.
-One in fifty true pairs is missed for half the work.  Of few points all is tried again in full."""
+"""Reduced gates of the first tries: sigmas of a separation, and a factor on the magnitude gate.
+They miss one in fifty true pairs for half the work. With few points all pairs are repeated in full.
+"""
 FEW_POINTS, MOST_FIRST = 6, 4
-"""Up to `FEW_POINTS` points, a candidate is first compared with all others; beyond, with three."""
+"""Number of points up to which a candidate is compared with all others first; beyond, with
+three.
+"""
 PREFILTERED_IN_TURN = 6
-"""Points of which three at a time are the first that a candidate is held against.
-Later all are: the most telling are bright, and the bright ones may all be no stars."""
+"""Number of most informative points among which the three points of the first comparison rotate.
+Later tries rotate among all points, since the bright ones may all be false.
+"""
 MAX_PREFILTERED = 12
-"""Further points that a candidate is held against."""
+"""Largest number of further points that a candidate is compared with."""
 REFINE_WORK = 60
-"""What refining a candidate costs, in candidates."""
+"""Work of refining a candidate, in units of one candidate."""
 MAX_WORK = 600_000
-"""Candidates, at most: some 30 ms."""
+"""Work limit of a search in candidates, about 30 ms."""
 ACCEPT_LOG = 7.5
 ACCEPT_LOG_PER_CLUTTER = 0.5
-"""Log evidence, and more for every point left unexplained, that ends the search."""
+"""Additional log evidence per unexplained point that is needed to end the search."""
 SAME_ATTITUDE_RAD = 2e-3
 
 
 WORK, COUNT, DEFERRED, BEST, LIMIT = 0, 1, 2, 3, 4
-"""The counters: candidates looked at, ledger entries, deferred candidates, most stars matched,
-and the candidates that may be looked at."""
+"""Indices of the counters: candidates examined, ledger entries, deferred candidates, most stars
+matched, and the work limit.
+"""
 PAIR, STAR_I, STAR_J, NEAR = 0, 1, 2, 3
-"""Columns of a deferred candidate: its points as i * MOST_POINTS + j, their stars, and a bit for
-each further point that may have a star."""
+"""Columns of a deferred candidate: its points as i * MOST_POINTS + j, their stars, and a bit mask
+of further points that may have a star.
+"""
 GOING_ON, ACCEPTED, AT_BOUND = 0, 1, 2
 
 
 class Plan(NamedTuple):
-    """How the candidates of a pair of points (i, j) are tried.
+    """The plan for testing the candidates of a pair of points (i, j).
 
-    At least `needed` of the `firsts` points in `turn` must possibly have a star,
-    at least `further` of the first `prefiltered` in `order` must have one; `strong` are
-    enough to be refined at once.  `gate` is for the separation in sigmas,
-    `gate_mag` for the magnitudes.
+    By bitmap, at least `needed` of the `firsts` points in `turn` must be able to have a star. At
+    least `further` of the first `prefiltered` in `order` must have one; `strong` are enough for
+    immediate refinement. `gate` is for the separation in sigmas, `gate_mag` for the magnitudes.
     """
 
     i: Any
@@ -95,10 +101,10 @@ class Plan(NamedTuple):
 
 @njit(nogil=True, error_model="numpy")
 def search(points, index, field, max_work, workspace):  # type: ignore[no-untyped-def]
-    """Fill the ledger with weighed matches.
+    """Search for attitudes of the points, and fill the ledger with weighed matches.
 
-    Returns how many there are, the work done and whether it reached its bound; no
-    work where even a perfect match would not be believed.
+    Returns the number of matches, the work, and true at the work limit; the work is zero if even a
+    perfect match would not be believed.
     """
     n = len(points.observed)
     gate_mag = magnitude_gate(field.magnitude_sigma)
@@ -108,7 +114,7 @@ def search(points, index, field, max_work, workspace):  # type: ignore[no-untype
         prefilter_in(workspace),
     )
     counters[:] = 0
-    # Ranks that no point has are worked out too, in vain.
+    # Unused ranks are computed too, with harmless values.
     prefilter.single[:] = 1.0
     counters[LIMIT] = min(MAX_WORK, max_work)
     fewest = posterior.fewest_stars(points, field.area, field.magnitude_sigma)
@@ -127,8 +133,8 @@ def search(points, index, field, max_work, workspace):  # type: ignore[no-untype
         pair_costs(points, index, done, top, pairs)
         done = top
         while state == GOING_ON:
-            # Any attitude that explains so many points has two of them in one of so many groups;
-            # of few points pairs that share none will do.
+            # A match of this many points has two in one of this many groups; with few points, pairs
+            # without a common point suffice.
             groups = max(further + 1, counters[BEST] - 1)
             if n <= 2 * groups:
                 groups = 0
@@ -138,7 +144,7 @@ def search(points, index, field, max_work, workspace):  # type: ignore[no-untype
                 break
             i, j = cheapest_pair(pairs, top, groups)
             if narrow_tries > 0 and (i < 0 or tries == narrow_tries):
-                # Of few points every pair is needed: now all that count, in full.
+                # With few points every pair is needed: now all possible pairs, in full.
                 narrow_tries = 0
                 pairs.used[:] = 1.0
                 pairs.covered[:] = 0
@@ -150,7 +156,7 @@ def search(points, index, field, max_work, workspace):  # type: ignore[no-untype
             prefiltered = predict(points, pairs.beyond, i, j, BITMAP_RADII_RAD[-1], prefilter)
             if prefiltered < further:
                 continue
-            # A poor lever does not reach all points: others must try again.
+            # A short baseline does not predict all points: its points must be tried again.
             pairs.covered[i] = pairs.covered[j] = pairs.covered[i] or prefiltered == n - 2
             may_be_narrow = tries <= (narrow_tries if n <= FEW_POINTS else FIRST_TRIES)
             plan = plan_of(n, i, j, prefiltered, tries, may_be_narrow, further, gate_mag, prefilter)
@@ -162,16 +168,17 @@ def search(points, index, field, max_work, workspace):  # type: ignore[no-untype
 
 @njit(nogil=True)
 def strong_of(further, prefiltered):  # type: ignore[no-untyped-def]
-    """How many further points make a candidate worth refining before others."""
+    """The number of further matched points from which a candidate is refined before others."""
     return min(further + 2, (3 * prefiltered + 3) // 4)
 
 
 @njit(nogil=True)
 def plan_of(n, i, j, prefiltered, tries, may_be_narrow, further, gate_mag, prefilter):  # type: ignore[no-untyped-def]
-    """How a pair's candidates are tried; which ranks are asked first goes to `prefilter.turn`."""
+    """The plan for testing a pair's candidates; the ranks checked first go to `prefilter.turn`."""
     prefiltered = min(prefiltered, MAX_PREFILTERED)
     narrow = prefiltered >= 2 and may_be_narrow
-    # Other points every time: those that tell most may be no stars.  Of few points all.
+    # Other points at every try, since the most informative may be false; with few points all of
+    # them.
     if narrow and (tries == 1 or n <= FEW_POINTS):
         firsts = needed = 2
     elif n <= FEW_POINTS:
@@ -179,7 +186,7 @@ def plan_of(n, i, j, prefiltered, tries, may_be_narrow, further, gate_mag, prefi
     elif tries <= FIRST_TRIES:
         firsts, needed = min(prefiltered, 3), min(prefiltered, 2)
     else:
-        # Where half of the points are no stars, two of three is too much to ask.
+        # If half of the points are false, two of three is too much to ask.
         firsts, needed = min(prefiltered, 2), 1
     turns = min(prefiltered, PREFILTERED_IN_TURN) if tries <= FIRST_TRIES else prefiltered
     for s in range(firsts):
@@ -192,7 +199,7 @@ def plan_of(n, i, j, prefiltered, tries, may_be_narrow, further, gate_mag, prefi
 
 @njit(nogil=True, error_model="numpy", forceinline=True)
 def try_pair(points, index, field, gate_mag, plan, workspace):  # type: ignore[no-untyped-def]
-    """Try every star pair that a pair of points may be; whether the search goes on."""
+    """Test every star pair of the index for a pair of points; returns the state of the search."""
     i, j = plan.i, plan.j
     prefilter, chunk, counters = (
         prefilter_in(workspace),
@@ -204,7 +211,7 @@ def try_pair(points, index, field, gate_mag, plan, workspace):  # type: ignore[n
     first, last = classes_of(points.magnitude[j], index.class_edge, plan.gate_mag)
     rows_i = rows_of_magnitude(index.brighter, points.magnitude[i], plan.gate_mag)
     rows_j = rows_of_magnitude(index.brighter, points.magnitude[j], plan.gate_mag)
-    # So many of the points asked first that one of them must have a star.
+    # Among this number of the first points at least one must have a star.
     asked = plan.firsts - plan.needed + 1
     for c in range(first, last + 1):
         at, end = np.int64(index.offset[c, low]), np.int64(index.offset[c, high + 1])
@@ -238,7 +245,7 @@ def try_pair(points, index, field, gate_mag, plan, workspace):  # type: ignore[n
 
 @njit(nogil=True)
 def bit_count(bits):  # type: ignore[no-untyped-def]
-    """How many bits are set."""
+    """The number of set bits in a mask."""
     count = 0
     while bits:
         bits &= bits - 1
@@ -248,10 +255,10 @@ def bit_count(bits):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, error_model="numpy", forceinline=True)
 def hits_of(points, index, gate_mag, plan, a, b, near, workspace):  # type: ignore[no-untyped-def]
-    """How many further points have a star in their place where i and j are a and b.
+    """The number of further points with a star at their exact place if i and j are stars a and b.
 
-    Of those that may, one by one until they are `strong`, or cannot be enough
-    any more; their stars go to the candidate's match.
+    Possible points are checked one by one until they are `strong`, or too few remain; their stars
+    go to the candidate's match.
     """
     prefilter, match, counters = (
         prefilter_in(workspace),
@@ -292,7 +299,9 @@ def hits_of(points, index, gate_mag, plan, a, b, near, workspace):  # type: igno
 
 @njit(nogil=True)
 def defer(workspace, i, j, a, b, near):  # type: ignore[no-untyped-def]
-    """Put off the candidate in which points i and j are stars a and b, with what is near."""
+    """Store a candidate for later: points i and j as stars a and b, and the mask of other
+    points.
+    """
     deferred, counters = deferred_in(workspace), counters_in(workspace)
     at = counters[DEFERRED]
     deferred[at, PAIR] = i * MOST_POINTS + j
@@ -302,7 +311,7 @@ def defer(workspace, i, j, a, b, near):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, forceinline=True)
 def try_deferred(points, index, field, gate_mag, further, workspace):  # type: ignore[no-untyped-def]
-    """Try the candidates that were put off, in their order; whether the search goes on."""
+    """Test the deferred candidates in their order; returns the state of the search."""
     prefilter, counters, deferred = (
         prefilter_in(workspace),
         counters_in(workspace),
@@ -334,7 +343,7 @@ def try_deferred(points, index, field, gate_mag, further, workspace):  # type: i
 
 @njit(nogil=True)
 def weigh(points, index, field, gate_mag, i, j, workspace):  # type: ignore[no-untyped-def]
-    """Refine the candidate and enter it in the ledger; whether it is beyond doubt."""
+    """Refine a candidate and enter it in the ledger; true if it is beyond doubt."""
     candidate, ledger, counters = (
         candidate_in(workspace),
         ledger_in(workspace),
@@ -359,7 +368,9 @@ def weigh(points, index, field, gate_mag, i, j, workspace):  # type: ignore[no-u
 
 @njit(nogil=True)
 def enter(candidate, weight, ledger, count):  # type: ignore[no-untyped-def]
-    """Enter a match in the ledger, for the lightest where it is full; how many there are."""
+    """Enter a match in the ledger, replacing the lightest if full; returns the number of
+    entries.
+    """
     match, weights = candidate.match, ledger.weight
     for h in range(count):
         same = True

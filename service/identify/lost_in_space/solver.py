@@ -1,7 +1,6 @@
-"""The production solver for points of which nothing is known: from vectors to an attitude.
+"""The lost-in-space solver: the attitude of a star field without prior knowledge.
 
-`LostInSpace(index, field).solve(direction, magnitude_mag, sigma_rad)` is all
-there is to call.
+Use it as `LostInSpace(index, field).solve(direction, magnitude_mag, sigma_rad)`.
 """
 
 import math
@@ -33,13 +32,13 @@ from service.vectors import Matrix, Vector, locked
 Rows = npt.NDArray[np.int64]
 _AT_REST = np.zeros(3)
 _BLOCKS: list[Vector] = []
-"""Blocks that no search uses at the moment: as many as searches ever ran at once."""
+"""Work blocks in reserve, as many as searches ever ran at once."""
 FEWEST_POINTS = 3
-"""Two stars alone tell no attitude from another."""
+"""Least number of points for a search: two stars are ambiguous."""
 
 
 NO_MIRROR_ABOVE = 25.0
-"""Log odds beyond which a field in a mirror is not thought of."""
+"""Log odds above which a field is not tested against its mirror image."""
 
 _REFUSALS = {
     decision.FOUND: None,
@@ -52,14 +51,16 @@ _REFUSALS = {
 
 @dataclass(frozen=True)
 class FieldOfView:
-    """What the tracker sees of the sky: a circle or a square about +Z, its limit, its photometry.
+    """Tracker's field of view: a circle or square about +Z, its limiting magnitude, its photometry.
 
-    `limit_mag` is NaN where the faintest star it shows is not known.
+    `limit_mag` is NaN if the faintest visible star is not known.
     """
 
     radius_deg: float
     half_width_deg: float | None = None
-    """Half the side of a square field, to whose corners `radius_deg` goes; None: a round one."""
+    """Half the side of a square field whose corners are at `radius_deg`; None for a circular
+    one.
+    """
     limit_mag: float = math.nan
     magnitude_sigma_mag: float = 0.5
 
@@ -67,13 +68,13 @@ class FieldOfView:
     def square(
         cls, side_deg: float, limit_mag: float = math.nan, magnitude_sigma_mag: float = 0.5
     ) -> "FieldOfView":
-        """A square field, edges `side_deg` apart."""
+        """A square field of view with edges `side_deg` apart."""
         tangent = math.tan(math.radians(0.5 * side_deg))
         corner_deg = math.degrees(math.atan(tangent * math.sqrt(2.0)))
         return cls(corner_deg, 0.5 * side_deg, limit_mag, magnitude_sigma_mag)
 
     def as_field(self) -> FieldBounds:
-        """The same as the kernels take it."""
+        """The field of view in the form that kernels take."""
         cosine = math.cos(math.radians(self.radius_deg))
         if self.half_width_deg is None:
             return FieldBounds(
@@ -87,39 +88,40 @@ class FieldOfView:
 
 
 class LostInSpaceResult(NamedTuple):
-    """What became of a field of points, rows in the order given.
+    """The result of a lost-in-space search; its rows are in the order of the given points.
 
-    A tuple, because making one must cost nothing beside a solution of ten
-    microseconds.  Where `refusal` says why there is no attitude, the arrays
-    tell of the best that was found, if anything.
+    It is a tuple because its construction must be cheap beside a solution of ten microseconds. If
+    `refusal` gives a reason for no attitude, the arrays describe the best candidate, if any.
     """
 
     refusal: NoAttitude | None
     matrices: npt.NDArray[np.float64]
-    """(2, 3, 3): see `attitude` and `covariance_rad2`."""
+    """The attitude and covariance matrices (2, 3, 3); see `attitude` and `covariance_rad2`."""
     star: Rows
-    """(n,) rows of the index, -1 for a point that no star explains."""
+    """The index row of each point's star (n,), -1 for an unexplained point."""
     log_odds: float
     """Natural logarithm of the odds of the attitude against all other explanations."""
     matched: int
     work: int
-    """Candidates looked at."""
+    """The number of candidates examined."""
     bounded: bool
-    """The search ended at the most work allowed."""
+    """True if the search ended at the work limit."""
 
     @property
     def attitude(self) -> Matrix | None:
-        """(3, 3): tracker components = this @ inertial; None where it was refused."""
+        """The attitude matrix (3, 3) from inertial to tracker components; None if refused."""
         return None if self.refusal is not None else np.asarray(self.matrices[0])
 
     @property
     def covariance_rad2(self) -> Matrix:
-        """(3, 3) of the small rotation about the tracker's axes."""
+        """The covariance (3, 3) of the attitude, for small rotations about the tracker's axes."""
         return np.asarray(self.matrices[1])
 
 
 class StarChances(NamedTuple):
-    """For each point: likeliest star (-1: none), its probability, that of none, second star."""
+    """For each point: most likely star (-1: none), its probability, that of no star, second
+    star.
+    """
 
     star: Rows
     probability: Vector
@@ -128,7 +130,7 @@ class StarChances(NamedTuple):
 
 
 class LostInSpace:
-    """The solver of one field of view and one index; calls do not depend on one another."""
+    """A lost-in-space solver for one field of view and one sky index; stateless between calls."""
 
     def __init__(self, index: SkyIndex, field: FieldOfView) -> None:
         self.index = index
@@ -143,11 +145,11 @@ class LostInSpace:
         velocity_c: Vector = _AT_REST,
         max_work: int = MAX_WORK,
     ) -> LostInSpaceResult:
-        """The attitude of points (n, 3) in tracker axes; magnitudes may be NaN.
+        """Solve the attitude of points (n, 3) in tracker axes; magnitudes may be NaN.
 
-        `sigma_rad` (n,) is one standard deviation per tangent axis.
-        `velocity_c` of the observer, inertial, in units of c, makes the stars
-        apparent; zero leaves them geometric.  At most `max_work` candidates are looked at.
+        `sigma_rad` (n,) is one standard deviation per tangent axis. `velocity_c` of the observer,
+        inertial, in units of c, is used for aberration; zero if uncorrected. At most `max_work`
+        candidates are examined.
         """
         block = _BLOCKS.pop() if _BLOCKS else np.empty(words_for(USUAL_POINTS))
         code, *rest = _solve(
@@ -165,7 +167,7 @@ class LostInSpace:
         sigma_rad: Vector,
         velocity_c: Vector = _AT_REST,
     ) -> StarChances:
-        """How sure the star of every point is, at the attitude that was found."""
+        """The probabilities of every point's star at the attitude of a result."""
         points = Points(*map(locked, (direction, magnitude_mag, sigma_rad, velocity_c)))
         doubt = 1.0 / (1.0 + math.exp(min(result.log_odds, 700.0)))
         gate = magnitude_gate(self.field.magnitude_sigma_mag)
@@ -179,7 +181,7 @@ class LostInSpace:
 
 @njit(nogil=True)
 def _sort_points(direction, magnitude, sigma, velocity, workspace):  # type: ignore[no-untyped-def]
-    """The points brightest first, those of unknown magnitude last, each in the order given."""
+    """Sort the points brightest first, unknown magnitudes last, ties in the given order."""
     n = len(direction)
     order, points = order_in(workspace), points_in(workspace)
     for k in range(n):
@@ -201,7 +203,7 @@ def _sort_points(direction, magnitude, sigma, velocity, workspace):  # type: ign
 
 @njit(nogil=True)
 def _decided(n, count, work, bounded, workspace, matrices, star):  # type: ignore[no-untyped-def]
-    """The decision, rows back in the order given: see `LostInSpaceResult`."""
+    """The decision with rows in the given order of points; see `LostInSpaceResult`."""
     ledger, order = ledger_in(workspace), order_in(workspace)
     best, log_odds, code = decision.decide(ledger, count)
     matched = 0
@@ -216,7 +218,7 @@ def _decided(n, count, work, bounded, workspace, matrices, star):  # type: ignor
     if n < FEWEST_POINTS:
         code = decision.TOO_FEW
     elif work == 0:
-        # Not searched: so few points, so coarsely known, are matched somewhere by chance.
+        # Not searched: chance would match so few or such inaccurate points somewhere.
         code = decision.DOUBTFUL
     return code, log_odds, matched, work, bounded
 
@@ -233,7 +235,7 @@ def _solve(direction, magnitude, sigma, velocity, store, field, max_work, block)
     if len(block) < words_for(n):
         block = np.empty(words_for(n))
     _sort_points(direction, magnitude, sigma, velocity, Workspace(block, n))
-    # What is made here is held here, so that what is called may borrow it.
+    # Arrays are allocated in this function and kept alive, so that callees may borrow them.
     code, log_odds, matched, work, bounded = _searched(
         *(n, store, field, max_work, block, matrices, star)
     )
@@ -251,7 +253,7 @@ def _searched(n, store, field, max_work, block, matrices, star):  # type: ignore
     code, log_odds, matched, _, _ = decided
     if code != decision.FOUND or log_odds > NO_MIRROR_ABOVE or n - matched < 2:
         return decided
-    # Stars that lie alike on both sides of a line are found in a mirror too, though not all others.
+    # Stars symmetric about a line match a mirrored sky too, but the others do not.
     weight = ledger.weight[:count].max()
     for k in range(n):
         points.observed[k, 0] = -points.observed[k, 0]

@@ -1,7 +1,7 @@
-"""The arrays that a search works in: views of one block of memory, kept from call to call.
+"""The work arrays of a lost-in-space search, as views of one reusable block of memory.
 
-A search takes microseconds, and asking the system for memory may take longer
-than the search.  A block is used by one call at a time.
+A search takes microseconds, and a memory allocation may take longer. A block is used by one call at
+a time.
 """
 
 from collections import namedtuple
@@ -14,17 +14,17 @@ from service.compiled.arrays import view_into
 from service.compiled.jit import njit
 
 LEDGER = 12
-"""Attitudes that are remembered, the heaviest."""
+"""Number of heaviest attitudes that a search keeps."""
 MOST_POINTS = 24
-"""Brightest points of which pairs are made."""
+"""Number of brightest points whose pairs are tried."""
 CHUNK = 64
-"""Pairs of stars that are prefiltered at a time."""
+"""Number of star pairs that are prefiltered at a time."""
 MAX_DEFERRED = 4096
-"""Candidates of few further points wait until all pairs were tried for one that has more."""
+"""Number of weak candidates that may wait until all pairs were tried."""
 USUAL_POINTS = 64
-"""A block that is kept is large enough for so many."""
+"""Number of points for which a reusable block has room."""
 RANKS = 16
-"""Places for the most telling points, `MAX_PREFILTERED` of them."""
+"""Number of slots for the most informative points; `MAX_PREFILTERED` are used."""
 
 _SHARED = np.dtype(
     [
@@ -53,7 +53,7 @@ _SHARED = np.dtype(
     ],
     align=True,
 )
-"""What stands in a block once, whatever the number of points."""
+"""Layout of the part of a block that is independent of the number of points."""
 _OF_A_POINT = np.dtype(
     [
         ("observed", np.float64, 3),
@@ -73,7 +73,7 @@ _OF_A_POINT = np.dtype(
         ("ledger", np.int64, LEDGER),
     ]
 )
-"""Its size for every point; after what stands there once, field by field for all points."""
+"""Layout of the part of a block per point; it follows the fixed part, field by field."""
 
 
 def _offsets(layout: np.dtype[Any]) -> Any:
@@ -86,11 +86,10 @@ SHARED_BYTES, POINT_BYTES = _SHARED.itemsize, _OF_A_POINT.itemsize
 
 
 class Points(NamedTuple):
-    """The observed points (n), brightest first, in the tracker's axes, +Z the boresight.
+    """The observed points (n), brightest first, in tracker axes with the boresight along +Z.
 
-    Magnitudes may be NaN.  Sigmas are one standard deviation per tangent axis,
-    radians.  `velocity` of the observer in inertial axes, in units of c, is
-    zero where aberration is not to be corrected.
+    Magnitudes may be NaN. Sigmas are one standard deviation per tangent axis, radians. `velocity`
+    of the observer in inertial axes, in units of c, is zero if aberration is not corrected.
     """
 
     observed: Any
@@ -100,11 +99,10 @@ class Points(NamedTuple):
 
 
 class FieldBounds(NamedTuple):
-    """The field of view: within a cosine of the boresight, and within two tangents.
+    """A field of view for kernels: within a cosine of the boresight, and within two tangents.
 
-    `area` is its solid angle, `limit_mag` the faintest star that the tracker
-    shows, NaN where that is not known, `magnitude_sigma` what a magnitude is
-    off by at random.
+    `area` is its solid angle, `limit_mag` the faintest star that the tracker shows, NaN if unknown,
+    `magnitude_sigma` the random error of a magnitude.
     """
 
     cos_radius: Any
@@ -116,9 +114,9 @@ class FieldBounds(NamedTuple):
 
 
 class Ledger(NamedTuple):
-    """Weighed attitudes.
+    """The weighed attitudes of a lost-in-space search.
 
-    `match` (LEDGER, n) rows of stars, log `weight` (LEDGER,), `attitude` and
+    `match` (LEDGER, n) has rows of stars; further log `weight` (LEDGER,), `attitude` and
     `covariance` (LEDGER, 3, 3).
     """
 
@@ -129,11 +127,10 @@ class Ledger(NamedTuple):
 
 
 class Candidate(NamedTuple):
-    """The present candidate.
+    """The candidate attitude that is being refined.
 
-    Its `match` (n,), how `near` (n,) its stars are by gates squared, its attitude `t`
-    and `covariance` (3, 3), a `matrix` (3, 3) to work in, and stars `inside` the field
-    (CHUNK,).
+    Its `match` (n,), the distances `near` (n,) of its stars in squared gates, its attitude `t` and
+    `covariance` (3, 3), a work `matrix` (3, 3), and a buffer of stars `inside` the field (CHUNK,).
     """
 
     match: Any
@@ -145,12 +142,11 @@ class Candidate(NamedTuple):
 
 
 class PointPairs(NamedTuple):
-    """What decides which pair of points is tried next.
+    """The data that determine which pair of points is tried next.
 
-    The `cost` (24, 24) of every pair, how much each point is set back for being `used`
-    (24,), which are `covered` (24,).  Of every point (n,) the `first` and `last` class of a
-    pair whose fainter star it is, the `share` of all pairs that these hold, and the
-    chance that it is a star `beyond` the limit.
+    The `cost` (24, 24) of every pair, the penalty of each point for being `used` (24,), and which
+    are `covered` (24,). For every point (n,) the `first` and `last` class of pairs whose fainter
+    star it may be, their `share` of all pairs, and the probability of a star `beyond` the limit.
     """
 
     cost: Any
@@ -163,12 +159,12 @@ class PointPairs(NamedTuple):
 
 
 class Prefilter(NamedTuple):
-    """Arrays with which one pair of points predicts the places of the other points.
+    """The arrays for predicting other points from one pair of points, and for the bitmaps.
 
-    For every point the `coefficients` (n, 3) of its place and its `gate` (n,); `order`
-    (n,): the most telling first, by `cost` (n,).  By rank in that order: the
-    coefficients once more in `single` precision (3, RANKS), the bitmap `level` that answers
-    for it and the present `cell` (RANKS,).  `turn` (4,): the ranks that are asked first.
+    For every point the `coefficients` (n, 3) of its place and its `gate` (n,); `order` (n,): the
+    most informative first, by `cost` (n,). By rank in that order: the coefficients in `single`
+    precision (3, RANKS), the bitmap `level` and the present `cell` (RANKS,). `turn` (4,): the ranks
+    that are checked first.
     """
 
     coefficients: Any
@@ -182,12 +178,11 @@ class Prefilter(NamedTuple):
 
 
 class Chunk(NamedTuple):
-    """Pairs of stars to be prefiltered together, each both ways round: two candidates.
+    """A chunk of star pairs to be prefiltered together, each in both orders: two candidates.
 
-    The `places` (6, CHUNK) of their stars.  Which of the two are `allowed` (CHUNK,) by their
-    magnitudes and which have been `seen` (CHUNK,) to have a star near: a bit for the pair as
-    it is, a second for the pair turned round.  The `cell` (2, CHUNK) where a further
-    point is looked for, and the candidates that are `possible` (2 CHUNK,).
+    The `places` (6, CHUNK) of their stars. Two bits for the two orders: those `allowed` (CHUNK,) by
+    magnitudes, and those `seen` (CHUNK,) to have a star near. The bitmap `cell` (2, CHUNK) of a
+    further point's predicted place, and the candidates that are `possible` (2 CHUNK,).
     """
 
     places: Any
@@ -198,10 +193,10 @@ class Chunk(NamedTuple):
 
 
 class Workspace(NamedTuple):
-    """What a search for n points writes to: a block of `words_for(n)` words.
+    """The memory of a search for n points: a block of `words_for(n)` words.
 
-    Passed on as it is, and cut where it is needed: code that passes on dozens of
-    arrays takes minutes to compile.
+    Kernels pass it on whole and take views where needed: passing dozens of arrays takes minutes to
+    compile.
     """
 
     block: Any
@@ -210,20 +205,20 @@ class Workspace(NamedTuple):
 
 @njit(nogil=True)
 def words_for(n):  # type: ignore[no-untyped-def]
-    """How many words of 64 bits a search for n points needs."""
+    """The number of 64-bit words that a search for n points needs."""
     return (SHARED_BYTES + n * POINT_BYTES) // 8
 
 
 @njit(nogil=True)
 def _by_point(workspace, offset, shape, dtype):  # type: ignore[no-untyped-def]
-    """A field of every point."""
+    """A view of a per-point field in a workspace."""
     block, n = workspace
     return view_into(block, SHARED_BYTES + n * offset, shape, dtype)
 
 
 @njit(nogil=True)
 def points_in(workspace):  # type: ignore[no-untyped-def]
-    """The points, brightest first."""
+    """The observed points in a workspace, brightest first; see `Points`."""
     n = workspace.n
     return Points(
         _by_point(workspace, POINT_AT.observed, (n, 3), np.float64),
@@ -235,13 +230,13 @@ def points_in(workspace):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def order_in(workspace):  # type: ignore[no-untyped-def]
-    """The rows (n,) of the points as they were given."""
+    """The original row numbers (n,) of the sorted points in a workspace."""
     return _by_point(workspace, POINT_AT.order, (workspace.n,), np.int64)
 
 
 @njit(nogil=True)
 def candidate_in(workspace):  # type: ignore[no-untyped-def]
-    """See `Candidate`."""
+    """The present candidate in a workspace; see `Candidate`."""
     block, n = workspace
     return Candidate(
         _by_point(workspace, POINT_AT.match, (n,), np.int64),
@@ -255,7 +250,7 @@ def candidate_in(workspace):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def point_pairs_in(workspace):  # type: ignore[no-untyped-def]
-    """See `PointPairs`."""
+    """The costs of point pairs in a workspace; see `PointPairs`."""
     block, n = workspace
     return PointPairs(
         view_into(block, AT.pair_cost, (MOST_POINTS, MOST_POINTS), np.float64),
@@ -270,7 +265,7 @@ def point_pairs_in(workspace):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def prefilter_in(workspace):  # type: ignore[no-untyped-def]
-    """See `Prefilter`."""
+    """The prediction arrays in a workspace; see `Prefilter`."""
     block, n = workspace
     return Prefilter(
         _by_point(workspace, POINT_AT.coefficients, (n, 3), np.float64),
@@ -286,7 +281,7 @@ def prefilter_in(workspace):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def chunk_in(workspace):  # type: ignore[no-untyped-def]
-    """See `Chunk`."""
+    """The chunk of star pairs in a workspace; see `Chunk`."""
     block = workspace.block
     return Chunk(
         view_into(block, AT.places, (6, CHUNK), np.float32),
@@ -299,7 +294,7 @@ def chunk_in(workspace):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def ledger_in(workspace):  # type: ignore[no-untyped-def]
-    """See `Ledger`."""
+    """The ledger of attitudes in a workspace; see `Ledger`."""
     block, n = workspace
     return Ledger(
         _by_point(workspace, POINT_AT.ledger, (LEDGER, n), np.int64),
@@ -311,14 +306,14 @@ def ledger_in(workspace):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def counters_in(workspace):  # type: ignore[no-untyped-def]
-    """What the search counts (5,)."""
+    """The counters (5,) of a search in a workspace."""
     return view_into(workspace.block, AT.counters, (5,), np.int64)
 
 
 @njit(nogil=True)
 def deferred_in(workspace):  # type: ignore[no-untyped-def]
-    """Deferred candidates (MAX_DEFERRED, 4).
+    """The deferred candidates (MAX_DEFERRED, 4) in a workspace.
 
-    The pair of points, its two stars, and which further points may have one.
+    Each has the pair of points, its two stars, and the mask of further points that may have a star.
     """
     return view_into(workspace.block, AT.deferred, (MAX_DEFERRED, 4), np.int32)

@@ -1,1 +1,1 @@
-"""Identification by planar triangles: the identifier `ptp`."""
+"""Star identification by planar triangles: the identifier `ptp`."""

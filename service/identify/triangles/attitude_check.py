@@ -1,10 +1,9 @@
-"""The attitude check: pairs of observed and catalog stars must be one rotated sky.
+"""The attitude check: validation of proposed star identities by one common rotation.
 
-Sides of triangles are the same in a mirror, and enough random points will agree
-with something.  So the proposals of an identifier are checked by three questions:
-which proposals agree with one another in every separation; which rotation, a
-proper one, carries them over; and how many of all observed stars then lie on a
-catalog star.  So many are asked for that chance does not bring them together.
+Triangles have the same sides in a mirror, and enough random points match some catalog stars. So
+proposed identities are checked in three steps: which of them agree with one another in every
+separation; which proper rotation maps them; and how many of all observed stars then lie on a
+catalog star. The required number makes a chance match unlikely.
 """
 
 import math
@@ -20,34 +19,34 @@ from service.sky.geometry.directions import axes_across, separation_rad
 from service.sky.geometry.star_hashes import nearest
 
 CHORD_SIGMAS = 4.0
-"""Two proposals agree where their separations do within so many standard deviations."""
+"""Sigmas within which the separations of two proposals must agree."""
 GATE_SIGMAS = 5.0
-"""A star lies on a catalog star within so many standard deviations."""
+"""Sigmas within which an observed star matches a catalog star."""
 FIRST_GATE = 2.0
-"""The first fit rests on few stars, and its gate is wider by this."""
+"""Factor on the gate of the first fit, which rests on few stars."""
 ALLOWED_CHANCE = 1e-4
-"""How often chance may be expected to do as well, anywhere in the sky; see `log_chance`."""
+"""Largest expected number of chance matches as good, over the whole sky; see `log_chance`."""
 LEAST_SHARE = 0.3
 """Least share of the observed stars that must be matched."""
 LEAST_WIDTH_SIGMAS = 8.0
-"""Least scatter of stars about a line, in sigmas: in a row they do not exclude a mirrored sky."""
+"""Least scatter of stars about a line, in sigmas, that excludes a mirrored sky."""
 LEAST_ODDS = 1e3
-"""The best attitude must be so many times less likely by chance than the best other one."""
+"""Least ratio of chance expectations between the second best and the best attitude."""
 CERTAIN_CHANCE = 1e-12
-"""So unlikely by chance that no other attitude is looked for."""
+"""Chance expectation below which no other attitude is looked for."""
 MAX_PROPOSALS, MAX_SEEDS = 1000, 256
 FIT_STEPS = 2
 
 
 @njit(nogil=True)
 def log_chance(observed, density, stars, separation, sigma_rad):  # type: ignore[no-untyped-def]
-    """The logarithm of how many attitudes put so many random points on catalog stars.
+    """The logarithm of the expected number of attitudes with as many chance matches.
 
-    Of `observed` points those of `density` lie on one of the catalog's `stars`
-    each: they are chosen, one of them put on any star, a second, at `separation`,
-    on any star in the ring about it, and each further one is expected at one
-    place, where there are `density` stars per steradian.  The two are those in
-    the least crowded places.  An upper bound: not every such match is looked for.
+    The matched points are a subset of `observed`, one per entry of `density` (stars per steradian
+    at its place). One of them may be on any of the catalog's `stars`, a second, at `separation`, on
+    any star in the ring about it, and each further one on a star at its predicted place. The first
+    two are those in the least crowded places. This is an upper bound, since the search does not
+    examine every such match.
     """
     gate = GATE_SIGMAS * sigma_rad
     matched = len(density)
@@ -76,14 +75,12 @@ def log_chance(observed, density, stars, separation, sigma_rad):  # type: ignore
 def check_attitude(  # type: ignore[no-untyped-def]
     observed, stars, density, pair_image, pair_star, match, rival, t
 ):
-    """Find the attitude that explains the proposals; whether there is one to believe.
+    """Find the attitude that explains proposed identities; true if one is believed.
 
-    `density` are the stars per steradian about each catalog star.  Proposals come
-    with the likeliest first.  Into `match` (n,) goes the catalog
-    row on which each observed star lies, -1 for none, into `rival` a second one
-    within the gate, into `t` (3, 3) the rotation from catalog axes to those of
-    the observed vectors.  Where two different attitudes do about as well, none
-    is believed.
+    `density` has the stars per steradian about each catalog star. Proposals are sorted most likely
+    first. Results are `match` (n,), the catalog row of each observed star, -1 for none, `rival`, a
+    second row within the gate, and `t` (3, 3), the rotation from catalog axes to those of the
+    observed vectors. If two different attitudes are about as good, none is believed.
     """
     n, count = len(match), min(len(pair_image), MAX_PROPOSALS)
     match[:] = -1
@@ -123,7 +120,7 @@ def check_attitude(  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def _is_same(match, other):  # type: ignore[no-untyped-def]
-    """True if two attitudes share at least half of the stars that either names."""
+    """True if two attitudes share at least half of the stars that either identifies."""
     same = named = 0
     for k in range(len(match)):
         if match[k] >= 0 or other[k] >= 0:
@@ -135,7 +132,7 @@ def _is_same(match, other):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def _group(observed, stars, speed, pair_image, pair_star, seed, members):  # type: ignore[no-untyped-def]
-    """Proposals that agree with the seed and with each other, the likeliest taken first."""
+    """Collect proposals that agree with a seed and with each other, most likely first."""
     members[0] = seed
     size = 1
     for other in range(len(pair_image)):
@@ -163,7 +160,7 @@ def _group(observed, stars, speed, pair_image, pair_star, seed, members):  # typ
 
 @njit(nogil=True)
 def _agree(observed, stars, speed, i, j, a, b):  # type: ignore[no-untyped-def]
-    """True if observed stars i and j are as far apart as catalog stars a and b; by chords."""
+    """True if observed stars i and j have the separation of catalog stars a and b, within noise."""
     if i == j or a == b:
         return False
     apart2 = should2 = 0.0
@@ -178,7 +175,7 @@ def _agree(observed, stars, speed, i, j, a, b):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, error_model="numpy")
 def _grow(observed, stars, density, widest, match, rival, scratch):  # type: ignore[no-untyped-def]
-    """Fit, lay all stars on the sky, fit again; ln of what chance could do, or infinity."""
+    """Fit an attitude, match all stars, fit again; the log of the chance expectation, or inf."""
     n = len(match)
     chance = math.inf
     for gate in (FIRST_GATE * GATE_SIGMAS, GATE_SIGMAS):
@@ -206,7 +203,7 @@ def _grow(observed, stars, density, widest, match, rival, scratch):  # type: ign
 
 @njit(nogil=True)
 def _widest(direction):  # type: ignore[no-untyped-def]
-    """The greatest separation in a field, at most a right angle: beyond it rings shrink again."""
+    """Largest separation of stars in a field, at most a right angle, beyond which rings shrink."""
     widest = 0.0
     for i in range(len(direction)):
         for j in range(i):
@@ -216,16 +213,16 @@ def _widest(direction):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def _lay(observed, stars, t, gate, match, rival):  # type: ignore[no-untyped-def]
-    """Which catalog star each observed one lies on under an attitude, and which other as well.
+    """Match each observed star to a catalog star at an attitude, and find a second match.
 
-    A catalog star that two observed ones lie on is neither's match.
+    A catalog star near two observed ones matches neither.
     """
     n = len(match)
     p, none = np.empty(3), np.empty(0, np.int32)
     for k in range(n):
         norm = 0.0
         for j in range(3):
-            # Back to catalog axes, and aberration taken off.
+            # Back in catalog axes, with aberration removed.
             p[j] = -observed.velocity[j]
             for i in range(3):
                 p[j] += t[i, j] * observed.direction[k, i]
@@ -254,9 +251,9 @@ def _lay(observed, stars, t, gate, match, rival):  # type: ignore[no-untyped-def
 
 @njit(nogil=True)
 def _is_right_handed(observed, match, t, references):  # type: ignore[no-untyped-def]
-    """True if matched stars lie where the attitude predicts, and their shape excludes a mirror.
+    """True if matched stars fit an attitude, and their shape excludes a mirror image.
 
-    Their scatter about the best line through them must be wider than the noise.
+    Their scatter about the best line through them must exceed the noise.
     """
     count = 0
     centre = np.zeros(3)

@@ -1,13 +1,12 @@
-"""The identifier `ptp`: planar triangles found by their principal component, with no prior.
+"""The identifier `ptp`: planar triangles looked up by their principal component, without a prior.
 
-Each observed star makes triangles with its nearest neighbours.  Their
-projections find guide triangles, their sides choose among these, and their
-votes order the proposals (Zhou & Ye 2015, sections 2.1 and 2.2).  The attitude
-check decides.  It replaces the paper's validation by sharing stars (2.3), which
-accepts a mirrored sky; `Proposals.validated` gives that for comparison.
+Each observed star makes triangles with its nearest neighbours. Guide triangles are looked up by
+projection, selected by sides, and their votes rank the proposed identities (Zhou & Ye 2015,
+sections 2.1 and 2.2). The attitude check decides. It replaces the paper's validation by sharing
+stars (2.3), which accepts a mirrored sky; `Proposals.validated` implements the paper's for
+comparison.
 
-The a priori attitude is not asked: observed vectors may be in any axes.
-Magnitudes are not used either.
+The a priori attitude and the magnitudes are not used: observed vectors may be in any axes.
 """
 
 import math
@@ -40,15 +39,15 @@ from service.vectors import ARCSEC_PER_RADIAN, Vector, locked
 
 IN_A_MIRROR = np.array([-1.0, 1.0, 1.0])
 SIGMA_FLOOR_ARCSEC = 1.0
-"""No star is taken as better known: the catalog serves a year, and parallax is left out."""
+"""Least position sigma of a star in arcsec: the catalog serves a year and has no parallaxes."""
 
 Rows = npt.NDArray[np.int32]
 
 
 def identify_ptp(sighting: Sighting) -> Identification:
-    """Identify the stars of one tracker, whatever the a priori attitude says of them.
+    """Identify the stars of one tracker by planar triangles, ignoring the a priori attitude.
 
-    Raises `ValueError` for a sighting that was given no guide database.
+    Raises `ValueError` for a sighting without a guide database.
     """
     if sighting.guide is None:
         raise ValueError("ptp needs the sighting's guide database")
@@ -60,12 +59,12 @@ def identify_ptp(sighting: Sighting) -> Identification:
 def identify_triangles(
     direction: Vector, sigma_rad: Vector, velocity_c: Vector, guide: Guide
 ) -> Identification:
-    """Identify stars given as unit vectors (n, 3) in any axes.
+    """Identify stars, given as unit vectors (n, 3) in any axes, by planar triangles.
 
-    Sigma is one standard deviation per tangent axis, `velocity_c` the observer's
-    in catalog axes, zero where aberration is not in the vectors.  Where the
-    attitude check finds nothing to believe every star is unmatched, whatever
-    its votes, which are distinct triangles that name the star alike.
+    Sigma is one standard deviation per tangent axis, `velocity_c` the observer's in catalog axes,
+    zero if the vectors are without aberration. If the attitude check fails, every star is
+    unmatched, whatever its votes, which count distinct triangles with the same identity for the
+    star.
     """
     n = len(direction)
     sigma_rad = np.maximum(sigma_rad, SIGMA_FLOOR_ARCSEC / ARCSEC_PER_RADIAN)
@@ -96,10 +95,10 @@ def identify_triangles(
 
 @dataclass(frozen=True)
 class Proposals:
-    """What triangles say: pairs of an observed star and a catalog row, the most votes first.
+    """Proposed identities from triangles: pairs of observed star and catalog row, most votes first.
 
-    `held`: a sharing star validates a triangle that says so.  `searched` is how
-    many guide triangles were looked at; `bounded` that more matched than are kept.
+    `held`: a sharing star validates a triangle with the identity. `searched` is the number of guide
+    triangles compared; `bounded` is true if more matched than can be kept.
     """
 
     image: Rows
@@ -110,7 +109,7 @@ class Proposals:
     bounded: bool
 
     def validated(self, n: int) -> Rows:
-        """The row that the sharing-star validation gives each of n stars, -1 for none."""
+        """Catalog row of each of n stars by the paper's sharing-star validation, -1 for none."""
         match = np.empty(n, np.int32)
         validate(self.image, self.star, self.votes, self.held, match)
         return match
@@ -119,9 +118,9 @@ class Proposals:
 def propose(
     direction: Vector, sigma_rad: Vector, speed_c: float, triangles: TriangleIndex, stars: int
 ) -> Proposals:
-    """Match the triangles of observed stars, and count what their corners say.
+    """Match triangles of observed stars to guide triangles, and count votes for star identities.
 
-    `speed_c` is the observer's, `stars` the length of the star list.
+    `speed_c` is the observer's speed, `stars` the length of the star list.
     """
     image, side = observed_triangles(direction, triangles)
     matched = np.empty((2, MAX_MATCHES), np.int32)
@@ -139,19 +138,18 @@ def propose(
 def explained(
     direction: Vector, sigma_rad: Vector, velocity_c: Vector, guide: Guide, image: Rows, star: Rows
 ) -> tuple[Rows, Rows]:
-    """All stars under the attitude that proposals lead to, from any source.
+    """Identities of all stars under the attitude derived from proposed identities.
 
-    Proposals are pairs of a row of `direction` and of the guide, the likeliest
-    first.  Gives each star the catalog row that it lies on and a second one that
-    it might lie on as well, -1 for none; -1 throughout where no attitude is
-    believed, nor one of a field that a mirror shows as well.
+    Proposals from any source are pairs of a row of `direction` and a row of the guide, most likely
+    first. Returns the catalog row of each star and a second possible row, -1 for none; all are -1
+    if no attitude is believed, or if the mirrored field matches as well.
     """
     match, rival = np.full((2, len(direction)), -1, np.int32)
     scene = scene_of(direction, sigma_rad, velocity_c, guide)
     believed = check_attitude(*scene, guide.density, image, star, match, rival, np.empty((3, 3)))
     matched = int((match >= 0).sum())
     if believed and len(match) - matched >= 2:
-        # Stars that lie alike on both sides of a line stand in a mirror too, all others do not.
+        # Stars symmetric about a line match a mirrored sky too, but all others do not.
         scene = scene_of(direction * IN_A_MIRROR, sigma_rad, velocity_c, guide)
         seen, other = np.full((2, len(direction)), -1, np.int32)
         if check_attitude(*scene, guide.density, image, star, seen, other, np.empty((3, 3))):
@@ -162,7 +160,7 @@ def explained(
 
 
 def observed_triangles(direction: Vector, triangles: TriangleIndex) -> tuple[Rows, Vector]:
-    """The triangles of observed stars, chosen as those of the guide: rows (t, 3), sides (t, 3)."""
+    """Triangles of observed stars, built like those of the guide: rows (t, 3), sides (t, 3)."""
     near = np.empty((len(direction), triangles.slaves), np.int32)
     nearest_slaves(direction, *chords(triangles.reach_deg), near)
     most = len(direction) * len(pairs_of_slaves(triangles.slaves))
@@ -174,7 +172,9 @@ def observed_triangles(direction: Vector, triangles: TriangleIndex) -> tuple[Row
 def scene_of(
     direction: Vector, sigma_rad: Vector, velocity_c: Vector, guide: Guide
 ) -> tuple[ObservedStars, ZoneStars]:
-    """Observed and guide stars as the kernels of the fit take them; no prior, no magnitudes."""
+    """Observed and guide stars in the form that the fit's kernels take, without prior or
+    magnitudes.
+    """
     reference_sigma = float(sigma_rad.min()) if len(sigma_rad) else 1.0
     nothing = np.empty(0)
     observed = ObservedStars(
@@ -204,7 +204,7 @@ def scene_of(
 
 
 def _tallies(n: int, proposals: Proposals) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Each star's highest and second-highest tally; equal in a tie."""
+    """The highest and second-highest numbers of votes of each star; equal in a tie."""
     highest, second = np.zeros((2, n), np.int64)
     for k, tally in zip(proposals.image.tolist(), proposals.votes.tolist(), strict=True):
         if highest[k] == 0:

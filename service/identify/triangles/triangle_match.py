@@ -1,14 +1,13 @@
-"""Observed triangles, the guide triangles that they could be, and the stars these name (PTP).
+"""Matching of observed triangles to guide triangles, and votes for star identities (PTP).
 
-The sides of an observed triangle are uncertain because its stars are.  What
-that means for its projection tells how wide a range of guide triangles to look
-at; what it means for each side tells which of those to believe (section 2.2).
+The position errors of an observed triangle's stars give the error of its projection, which sets the
+range of guide triangles to compare, and the error of each side, which selects among them (section
+2.2).
 
-A star must then be itself in two triangles, which is the sharing-star validation
-(section 2.3).  A false match names three stars at random; two false matches seldom name the
-same star for the same spot.  A star that two triangles name alike validates
-itself and every triangle that holds it.  Counted are distinct triangles of the
-image: one triangle seen from two of its corners says nothing twice.
+A star must then have the same identity in two triangles: the sharing-star validation (section 2.3).
+A false match names three stars at random; two false matches seldom agree on the identity of a star.
+A star with one identity in two triangles validates itself and every triangle that contains it.
+Distinct triangles of the image are counted: a triangle seen from two of its corners counts once.
 """
 
 import math
@@ -22,20 +21,20 @@ from service.sky.geometry.kvector import rows_within
 from service.sky.geometry.triangles import SIDE_SCALE, TriangleIndex, chord
 
 SIGMAS = 3.0
-"""How far a true triangle may be off, in its own standard deviations: 99.7 % are nearer."""
+"""Largest error of a true triangle, in its own standard deviations: 99.7 % are within."""
 MAX_MATCHES = 20_000
-"""What is kept for one sighting; a real field leaves tens, at a pixel of noise."""
+"""Largest number of triangle matches kept for one sighting; a real field gives tens."""
 Rows = npt.NDArray[np.int32]
 Held = npt.NDArray[np.bool_]
 LEAST_TRIANGLES = 2
-"""In so many triangles a sharing star carries the same identity."""
+"""Least number of triangles in which a sharing star must have the same identity."""
 
 
 @njit(nogil=True)
 def spread_along(h0, h1, h2, b, sigma):  # type: ignore[no-untyped-def]
-    """The variance along a gradient h of a unit vector b that has noise across it alone.
+    """The variance along a gradient h of a unit vector b with isotropic noise in its tangent plane.
 
-    h R h^T with R = sigma^2 (I - b b^T), the tangent-plane model of equation 12.
+    It is h R h^T with R = sigma^2 (I - b b^T), the tangent-plane model of equation 12.
     """
     along = h0 * b[0] + h1 * b[1] + h2 * b[2]
     return sigma * sigma * (h0 * h0 + h1 * h1 + h2 * h2 - along * along)
@@ -73,12 +72,11 @@ def projection_sigma(m, i, j, axis, sigma_m, sigma_i, sigma_j):  # type: ignore[
 
 
 class ImageTriangles(NamedTuple):
-    """The triangles (t) of n observed stars.
+    """The triangles (t) of n observed stars, in the form that kernels take.
 
-    `direction` (n, 3) are unit vectors in any axes, `sigma_rad` (n,) their noise.
-    `speed_c` is the observer's: aberration changes a side by at most this share of it.
-    `star` (t, 3) are rows of `direction`: master, nearer slave, farther slave; `side`
-    (t, 3) as in `TriangleIndex`.
+    `direction` (n, 3) are unit vectors in any axes, `sigma_rad` (n,) their noise. `speed_c` is the
+    observer's speed: the largest relative change of a side by aberration. `star` (t, 3) are rows of
+    `direction`: master, nearer slave, farther slave; `side` (t, 3) as in `TriangleIndex`.
     """
 
     direction: Any
@@ -89,7 +87,7 @@ class ImageTriangles(NamedTuple):
 
 
 class GuideTriangles(NamedTuple):
-    """A `TriangleIndex` as kernels take it: sides, projection with its k-vector, axis and mean."""
+    """The guide triangles of an index for kernels: sides, projection, principal axis and mean."""
 
     side: Any
     value: Any
@@ -101,7 +99,7 @@ class GuideTriangles(NamedTuple):
 
 
 def guide_triangles(index: TriangleIndex) -> GuideTriangles:
-    """The guide triangles of an index."""
+    """The guide triangles of an index, converted for kernels."""
     projection = index.projection
     return GuideTriangles(
         side=index.side,
@@ -116,11 +114,10 @@ def guide_triangles(index: TriangleIndex) -> GuideTriangles:
 
 @njit(nogil=True)
 def match_triangles(image, guide, matched_image, matched_guide):  # type: ignore[no-untyped-def]
-    """Every pair of an observed and a guide triangle that agree in all three sides.
+    """Find every pair of an observed and a guide triangle that agree in all three sides.
 
-    Their rows go to `matched_image` and `matched_guide`.  Returns how many there
-    are, how many guide triangles were looked at, and whether more would have
-    agreed than can be kept.
+    Their rows go to `matched_image` and `matched_guide`. Returns the number of matches, the number
+    of guide triangles compared, and true if more matched than can be kept.
     """
     count = searched = 0
     tolerance = np.empty(3)
@@ -162,13 +159,12 @@ def match_triangles(image, guide, matched_image, matched_guide):  # type: ignore
 def count_pairs(
     image: Rows, star: Rows, stars: int, pair_image: Rows, pair_star: Rows, votes: Rows, held: Held
 ) -> int:
-    """Tally (observed star, catalog star) pairs over matches, the most votes first.
+    """Count votes for (observed star, catalog star) pairs over triangle matches, most votes first.
 
-    `image` and `star` (m, 3) hold the three observed rows and the three catalog
-    rows of each match in one order; `stars` is the number of catalog rows.
-    Returns how many pairs were written to `pair_image`, `pair_star`, `votes` and
-    `held`, each of length 3 m.  A vote is a distinct set of three observed
-    stars; held is a pair of which some match has a sharing star.
+    `image` and `star` (m, 3) hold the three observed rows and the three catalog rows of each match,
+    in corresponding order; `stars` is the number of catalog rows. Returns how many pairs were
+    written to `pair_image`, `pair_star`, `votes` and `held`, each of length 3 m. A vote is a
+    distinct set of three observed stars; `held` marks pairs with a sharing star in some match.
     """
     low, middle, high = np.sort(image, axis=1).astype(np.int64).T
     triples, number = np.unique((low << 40) | (middle << 20) | high, return_inverse=True)
@@ -188,11 +184,12 @@ def count_pairs(
 
 @njit(nogil=True)
 def validate(pair_image, pair_star, votes, held, match):  # type: ignore[no-untyped-def]
-    """Into `match` (n,) the catalog row that sharing stars validate for each, -1 for none.
+    """Choose the catalog row of each observed star by sharing stars, into `match` (n,), -1 for
+    none.
 
-    Pairs come with the most votes first.  Of several held pairs of a star that
-    with the most votes counts, and none of two with equally many; a catalog
-    star goes likewise to the observed star with the most votes for it.
+    Pairs are sorted by votes. Among the held pairs of a star that with the most votes counts, and
+    none if two are tied; a catalog star likewise goes to the observed star with the most votes for
+    it.
     """
     match[:] = -1
     n = len(match)

@@ -1,1 +1,1 @@
-"""Fink & Shoup's STARID steps: pair tests, match groups, votes."""
+"""The steps of Fink & Shoup's STARID: pair tests, match groups, votes."""

@@ -1,12 +1,12 @@
-"""Van Bezooijen's test of the field of view's rotation, which the prototype left out.
+"""Van Bezooijen's test of the field of view's rotation, which the paper's prototype left out.
 
-A candidate pair says how the tracker would have to be turned for the observed
-pair to fall on it.  The part of that turn that is about the boresight must be
-small, for the roll of the tracker is known better than where it points.
+A candidate pair implies a rotation of the tracker that maps the observed pair to it. The part of
+that rotation about the boresight must be small, since the tracker's roll is known better than its
+pointing.
 
-In a cap that part is what remains when the boresight has gone the short way.
-In a band the rotation about the pole is open: there it is the angle, seen along
-the turned boresight, between the pole and where the turn would put it.
+In a cap that part is what remains after the shortest rotation of the boresight. In a band the
+rotation about the pole is free: the part is the angle, seen along the rotated boresight, between
+the pole and the rotated pole.
 """
 
 import math
@@ -28,11 +28,10 @@ def rotation_rad(
     axis: Vector,
     is_band: bool,
 ) -> float:
-    """The rotation about the boresight, 0 to pi, if `first` is candidate `a` and `second` is `b`.
+    """The rotation about the boresight, 0 to pi, that maps the pair `first`, `second` to `a`, `b`.
 
-    All are unit vectors, inertial through the a priori attitude, of whose arrays
-    the first three numbers are read.  It is worked out in plain numbers, so that
-    it neither allocates nor can fail.
+    All are unit vectors, inertial by the a priori attitude; only the first three numbers of each
+    array are read. Plain numbers are used, so that the function neither allocates nor fails.
     """
     observed, candidate = _frame(first, second), _frame(a, b)
     looking = boresight[0], boresight[1], boresight[2]
@@ -41,7 +40,7 @@ def rotation_rad(
         pole = axis[0], axis[1], axis[2]
         expected, found = pole, _carried(pole, observed, candidate)
     else:
-        # What lies across the boresight, carried the short way to where the boresight comes.
+        # A direction perpendicular to the boresight, moved with the boresight's shortest rotation.
         across = _less(observed[1], _dot(observed[1], looking), looking)
         share = _dot(across, turned) / (1.0 + _dot(looking, turned))
         middle = looking[0] + turned[0], looking[1] + turned[1], looking[2] + turned[2]
@@ -54,7 +53,7 @@ def rotation_rad(
 
 @njit_no_refcount
 def _frame(first: Vector, second: Vector) -> Axes:
-    """The middle of two unit vectors, the direction from one to the other, and their normal."""
+    """A frame of two unit vectors: their middle, the direction between them, and the normal."""
     middle = first[0] + second[0], first[1] + second[1], first[2] + second[2]
     along = second[0] - first[0], second[1] - first[1], second[2] - first[2]
     middle, along = _unit(middle), _unit(along)
@@ -63,7 +62,7 @@ def _frame(first: Vector, second: Vector) -> Axes:
 
 @njit_no_refcount
 def _carried(v: Triple, observed: Axes, candidate: Axes) -> Triple:
-    """The vector, turned as the observed frame is turned to the candidate's."""
+    """A vector, rotated by the rotation from the observed to the candidate frame."""
     x, y, z = _dot(observed[0], v), _dot(observed[1], v), _dot(observed[2], v)
     one, two, three = candidate
     return (

@@ -1,10 +1,10 @@
-"""Van Bezooijen's match groups: the most observed stars whose candidates agree pair by pair.
+"""Van Bezooijen's match groups: the largest sets of observed stars with mutually consistent
+candidates.
 
-The pairs that survive the tests make a graph: a node is an observed star taken
-for a zone star, an edge a pair that says so of both its stars.  A match group
-is a set of nodes of which every two are joined; the largest ones count.  A
-star's candidates are those of any largest group, each with the votes of the
-group's other stars; stars that are in none have no votes.
+The pairs that survive the tests form a graph: a node is an observed star identified with a zone
+star, an edge a pair that supports both of its identities. A match group is a clique of the graph;
+only the largest ones count. A star's candidates are those of any largest group, each with the votes
+of the group's other stars; stars in no group have no votes.
 """
 
 from typing import Any
@@ -17,22 +17,21 @@ from service.compiled.jit import njit
 Integers = npt.NDArray[Any]
 
 MAX_EDGES = 1 << 18
-"""More surviving pairs than these are not searched; the votes stand as they are."""
+"""Largest number of surviving pairs for which groups are searched; beyond, all votes count."""
 MAX_WORK = 50_000_000
-"""Nodes looked at in one search: about a quarter of a second."""
+"""Work limit of one search in nodes visited, about a quarter of a second."""
 MAX_HELD = 1 << 22
-"""Nodes held at one time."""
+"""Largest number of nodes held at one time."""
 
 
 def keep_largest_groups(
     votes: Integers, edges: Integers, max_work: int = MAX_WORK
 ) -> tuple[bool, int]:
-    """Leave in `votes` (n, m) only those of the largest groups.
+    """Remove from `votes` (n, m) all votes outside of the largest match groups.
 
-    Returns whether the search was cut short, and the work, in nodes looked at.
-    `edges` (E, 4): observed star, its zone row, the other observed star, its
-    zone row.  Of a search that was cut short, every node that might still
-    belong to a group of the size found counts as belonging.
+    Returns true if the search was cut short, and the work in nodes visited. `edges` (E, 4):
+    observed star, its zone row, the other observed star, its zone row. After a search cut short,
+    every node that might still belong to a group of the size found is kept.
     """
     if not len(edges):
         return False, 0
@@ -54,9 +53,9 @@ def keep_largest_groups(
 
 @njit(nogil=True)
 def _largest(star, start, neighbour, member, work):  # type: ignore[no-untyped-def]
-    """The size of the largest groups, and the work that is left.
+    """The size of the largest match groups, and the remaining work.
 
-    `member` marks the nodes that are in one of them.
+    `member` is set to mark the nodes in one of the groups.
 
     Nodes are in order of `star`; the neighbours of node v are
     neighbour[start[v]:start[v + 1]], ascending.
@@ -86,7 +85,7 @@ def _largest(star, start, neighbour, member, work):  # type: ignore[no-untyped-d
 
 @njit(nogil=True)
 def _stars(star, nodes):  # type: ignore[no-untyped-def]
-    """How many observed stars some nodes, ascending, belong to."""
+    """The number of observed stars that a sorted list of nodes belongs to."""
     count, last = 0, -1
     for node in nodes:
         if star[node] != last:
@@ -97,11 +96,11 @@ def _stars(star, nodes):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def _group_of(v, near, least, star, start, neighbour, group, work):  # type: ignore[no-untyped-def]
-    """A group of at least `least` nodes with `v` in it, of the nodes `near`; 0 where there is none.
+    """A match group of at least `least` nodes with `v`, from the nodes `near`; size 0 if none.
 
-    Depth first, one level a node of the group; held[at[d]:end[d]] are the nodes
-    of level d that agree with all above and are still to be tried.  Gives the
-    size and the work that is left.
+    Depth first, with one level per node of the group; held[at[d]:end[d]] are the nodes of level d
+    that are consistent with all levels above and still to be tried. Returns the size and the
+    remaining work.
     """
     group[0] = v
     reach = _stars(star, near)
@@ -116,7 +115,7 @@ def _group_of(v, near, least, star, start, neighbour, group, work):  # type: ign
     end[0] = len(near)
     depth = 0
     while depth >= 0:
-        # With the nodes above, the stars that are still open here must be enough.
+        # The stars still open at this level, with the nodes above, must be enough.
         open_nodes = held[at[depth] : end[depth]]
         work -= len(open_nodes)
         if work <= 0:
@@ -148,7 +147,7 @@ def _group_of(v, near, least, star, start, neighbour, group, work):  # type: ign
 
 @njit(nogil=True, inline="always")
 def _common(ones, others, out):  # type: ignore[no-untyped-def]
-    """Write what two ascending lists share; how many."""
+    """Write the common elements of two sorted lists; returns their number."""
     count = i = j = 0
     while i < len(ones) and j < len(others):
         if ones[i] < others[j]:

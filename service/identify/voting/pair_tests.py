@@ -1,8 +1,7 @@
-"""STARID, steps 1 to 10: which candidate pairs survive, and the votes that they cast.
+"""Steps 1 to 10 of STARID: tests of candidate pairs, and the votes of those that survive.
 
-Source: Fink & Shoup 1994, sections 2.1 and 2.2.  The names of the paper stand
-in the comments.  `cast_votes` allocates nothing, holds no state and releases the
-interpreter's lock.
+Source: Fink & Shoup 1994, sections 2.1 and 2.2. Comments give the paper's names. `cast_votes`
+allocates nothing, holds no state and releases the interpreter's lock.
 """
 
 import math
@@ -20,9 +19,9 @@ from service.sky.geometry.directions import separation_rad
 
 UNMATCHED, UNIQUE, AMBIGUOUS = (int(outcome) for outcome in Outcome)
 
-# What a difference of polar angles that is kept in single precision may be off, in radians.
+# Error in radians of a difference of polar angles stored in single precision.
 _SINGLE = 1e-6
-# On a right angle, where the order of a pair turns, rounding shall reject neither.
+# Tolerance at a right angle, where the order of a pair flips, so that rounding rejects neither.
 _ROUNDING = 1e-14
 
 REJECTED = 2
@@ -30,9 +29,9 @@ REJECTED = 2
 
 
 class Rulebook(NamedTuple):
-    """The rules of `Rules` as kernels take them: the tests that are made, and their tolerances.
+    """The rules of an identification for kernels: the tests to be made, and their tolerances.
 
-    No votes are cast where that takes more than `max_comparisons`.
+    No votes are cast if that takes more than `max_comparisons`.
     """
 
     limits: Any
@@ -41,11 +40,11 @@ class Rulebook(NamedTuple):
 
 
 class Ballots(NamedTuple):
-    """The votes of n observed stars for m zone stars.
+    """The votes of n observed stars for m zone stars, with work arrays.
 
-    `votes` (n, m) are counted up; `voted` (n, m) lists the zone stars that got
-    votes, `counts` (n,) of them.  `edges` (0, 4), or as many rows as half the votes,
-    gets the observed star, zone row, other observed star and zone row of each pair.
+    `votes` (n, m) are counts; `voted` (n, m) lists the zone stars with votes, `counts` (n,) their
+    number. `edges`, either empty (0, 4) or with half as many rows as votes, gets the observed star,
+    zone row, other observed star and zone row of each pair.
     """
 
     votes: Any
@@ -55,11 +54,11 @@ class Ballots(NamedTuple):
 
 
 class Tallies(NamedTuple):
-    """What the votes come to, for each of n observed stars.
+    """The results of the votes for each of n observed stars.
 
-    The `outcome`, the winner's `star` (-1: none) and the `highest` and `second`
-    tally, all (n,); `rivals` (n, R) those who share an ambiguous star's highest
-    tally, the brightest first, then -1.
+    The `outcome`, the winner's `star` (-1: none) and the `highest` and `second` tally, all (n,);
+    `rivals` (n, R) the zone stars that tie for an ambiguous star's highest tally, brightest first,
+    then -1.
     """
 
     outcome: Any
@@ -70,12 +69,12 @@ class Tallies(NamedTuple):
 
 
 class ObservedPair(NamedTuple):
-    """Observed stars i and j as the tests see them.
+    """A pair of observed stars i and j, with the quantities that the pair tests use.
 
-    `separation` in radians; the unit normal n0, n1, n2 to both, and `normal` the
-    sine of their angle; their angles `polar_i` and `polar_j` to the axis, zero where
-    there is no pole test, and the size of their difference.  `bright` and `dim` are
-    the stars by magnitude, and `ordered` whether the magnitudes tell their order.
+    `separation` in radians; the unit normal n0, n1, n2 to both, and `normal` the sine of their
+    angle; the stars' angles `polar_i` and `polar_j` to the axis, zero without a pole test, and the
+    absolute difference. `bright` and `dim` are the stars by magnitude; `ordered` is true if the
+    magnitudes differ enough.
     """
 
     i: Any
@@ -95,18 +94,19 @@ class ObservedPair(NamedTuple):
 
 @njit_no_refcount
 def cast_votes(sighted, zone, polar, bounds, rules, ballots):  # type: ignore[no-untyped-def]
-    """Cast the votes of every observed pair's surviving candidate pairs; how many were compared.
+    """Cast the votes of every observed pair's surviving candidate pairs; returns the number
+    compared.
 
-    Where they are more than allowed, some pairs have not been looked at.
-    `sighted`, `zone` and `bounds` are those of `Sighting`; `polar` (m,) keeps a zone
-    star's angle to the axis, -1 where it is not worked out yet.
+    If that number exceeds the limit, some pairs were not compared. `sighted`, `zone` and `bounds`
+    are those of `Sighting`; `polar` (m,) caches a zone star's angle to the axis, -1 if not computed
+    yet.
     """
     separation_tolerance, switches = rules.limits.separation, rules.switches
     pair_separation, pair_difference = zone.pair_separation, zone.polar_difference
     pair_brighter, pair_dimmer = zone.pair_rows[0], zone.pair_rows[1]
     kept = compared = 0
     n = len(sighted.direction)
-    # Cheap, and never too strict: the test itself follows.
+    # A cheap filter that is never too strict: the exact test follows.
     look_at_difference = switches.pole and len(pair_difference) > 0
     difference_tolerance = rules.limits.pole_difference + 2.0 * bounds.off_axis + _SINGLE
     cross_square = 4.0 * math.sin(0.5 * rules.limits.cross_product) ** 2 + _ROUNDING
@@ -156,7 +156,7 @@ def _observed_pair(sighted, i, j, axis, rules):  # type: ignore[no-untyped-def]
     if rules.switches.pole:
         polar_i = separation_rad(direction[i], axis)
         polar_j = separation_rad(direction[j], axis)
-    # Steps 1 and 2: is the order of the observed pair told by the magnitudes? (LMAGT)
+    # Steps 1 and 2: do the magnitudes give the order of the observed pair? (LMAGT)
     bright, dim = i, j
     if magnitude[j] < magnitude[i]:
         bright, dim = j, i
@@ -172,9 +172,9 @@ def _observed_pair(sighted, i, j, axis, rules):  # type: ignore[no-untyped-def]
 
 @njit_inlined
 def _order_of(sighted, zone, polar, bounds, rules, pair, cross_square, a, b):  # type: ignore[no-untyped-def]
-    """LORD of a candidate pair: 1 when i goes with a and j with b, -1 the other way round.
+    """The order (LORD) of a candidate pair: 1 if i matches a and j matches b, -1 for the reverse.
 
-    0 where both may be, and `REJECTED` where a test says neither.
+    0 if both orders are possible, and `REJECTED` if a test excludes both.
     """
     star, switches = zone.vector_mag, rules.switches
     order = 0
@@ -187,7 +187,7 @@ def _order_of(sighted, zone, polar, bounds, rules, pair, cross_square, a, b):  #
             return REJECTED
         order = 1 if pair.bright == pair.i else -1
 
-    # The cached zone may be wider than the one that was asked for.
+    # The cached zone may be wider than the requested one.
     if switches.pole or not bounds.all_inside:
         if polar[a] < 0.0:
             polar[a] = separation_rad(star[a], bounds.axis)
@@ -221,27 +221,27 @@ def _order_of(sighted, zone, polar, bounds, rules, pair, cross_square, a, b):  #
 
 @njit_inlined
 def _order_by_pole(pair, polar_a, polar_b, tolerance, order):  # type: ignore[no-untyped-def]
-    """Step 7: greater angle with greater, lesser with lesser, within BANTOL2."""
+    """Step 7 of STARID: larger polar angle with larger, smaller with smaller, within BANTOL2."""
     greater = max(pair.polar_i, pair.polar_j) - max(polar_a, polar_b)
     lesser = min(pair.polar_i, pair.polar_j) - min(polar_a, polar_b)
     if abs(greater) > tolerance or abs(lesser) > tolerance:
         return REJECTED
     same = (pair.polar_i > pair.polar_j) == (polar_a > polar_b)
     pole_order = 1 if same else -1
-    # Steps 8 and 9: the magnitudes, where they told an order, must agree.
+    # Steps 8 and 9: an order given by the magnitudes must agree.
     return REJECTED if order != 0 and order != pole_order else pole_order
 
 
 @njit_inlined
 def _order_by_cross_product(pair, a, b, cross_square, order):  # type: ignore[no-untyped-def]
-    """Steps 4, 5 and 10: CRSSEP, or its supplement CRSSEN for the other order."""
+    """Steps 4, 5 and 10 of STARID: CRSSEP, or its supplement CRSSEN for the other order."""
     c0 = a[1] * b[2] - a[2] * b[1]
     c1 = a[2] * b[0] - a[0] * b[2]
     c2 = a[0] * b[1] - a[1] * b[0]
     square = c0 * c0 + c1 * c1 + c2 * c2
     if pair.normal == 0.0 or square == 0.0:
         return REJECTED
-    # By chords, which need no arc sine.
+    # Chords need no arc sine.
     norm = math.sqrt(square)
     d0, d1, d2 = pair.n0 * norm - c0, pair.n1 * norm - c1, pair.n2 * norm - c2
     along = d0 * d0 + d1 * d1 + d2 * d2 <= cross_square * square
@@ -251,13 +251,13 @@ def _order_by_cross_product(pair, a, b, cross_square, order):  # type: ignore[no
         return order if (along if order == 1 else against) else REJECTED
     if not (along or against):
         return REJECTED
-    # Beyond 90 deg both may pass: the order stays open, both pairings vote.
+    # Beyond 90 deg both orders may pass: the order stays open, and both pairings vote.
     return 0 if along == against else 1 if along else -1
 
 
 @njit_inlined
 def _order_by_rotation(sighted, bounds, tolerance, pair, star, a, b, order):  # type: ignore[no-untyped-def]
-    """Choose the order of a pair that rotates the field little, if no earlier test chose one."""
+    """The order of a pair, if its rotation of the field about the boresight is within tolerance."""
     first, second = sighted.direction[pair.i], sighted.direction[pair.j]
     boresight, axis, is_band = sighted.boresight, bounds.axis, bounds.is_band
     along, against = order >= 0, order <= 0
@@ -274,7 +274,7 @@ def _order_by_rotation(sighted, bounds, tolerance, pair, star, a, b, order):  # 
 
 @njit_inlined
 def _vote(ballots, kept, i, a, j, b):  # type: ignore[no-untyped-def]
-    """A vote that observed star i is a and j is b; how many pairs are kept as edges."""
+    """Vote for observed star i being a and j being b; returns the number of edges kept."""
     _count_up(ballots, i, a)
     _count_up(ballots, j, b)
     edges = ballots.edges
@@ -295,7 +295,7 @@ def _count_up(ballots, i, row):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def tallies_of(found, first, last):  # type: ignore[no-untyped-def]
-    """Rows of `IdentifiedColumns` with the tallies of the stars from `first` to before `last`."""
+    """Vote results of the stars from `first` to before `last`, as views of `IdentifiedColumns`."""
     return Tallies(
         outcome=found.outcome[first:last],
         star=found.star[first:last],
@@ -307,9 +307,9 @@ def tallies_of(found, first, last):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def tally(which, seen, zone, star_of, limits, switches, found):  # type: ignore[no-untyped-def]
-    """Cast and count the votes of those of many sightings that a zone serves.
+    """Cast and count the votes of the sightings that a zone serves.
 
-    `which` are their rows in the columns `seen` and `found`.
+    `which` are the sightings' rows in the columns `seen` and `found`.
     """
     stars, most = len(zone.direction), 0
     for s in which:
@@ -343,7 +343,7 @@ def tally(which, seen, zone, star_of, limits, switches, found):  # type: ignore[
 
 @njit(nogil=True)
 def polar_angles(zone_polar, stars, bounds, rules):  # type: ignore[no-untyped-def]
-    """The zone stars' angles to the axis for `cast_votes`: known ones, or -1; (0,) if not asked."""
+    """Zone stars' angles to the axis for `cast_votes`: known ones, or -1; (0,) if not needed."""
     if bounds.all_inside and not rules.switches.pole:
         return np.empty(0)
     polar = np.full(stars, -1.0)
@@ -354,16 +354,16 @@ def polar_angles(zone_polar, stars, bounds, rules):  # type: ignore[no-untyped-d
 
 @njit_no_refcount
 def discard_votes(ballots):  # type: ignore[no-untyped-def]
-    """Leave no votes: of those of some pairs alone a winner would not be the winner of all."""
+    """Discard all votes, since a winner of a partial count might not win the full one."""
     ballots.votes[:] = 0
     ballots.counts[:] = 0
 
 
 @njit_no_refcount
 def count_votes(ballots, star_of, tallies):  # type: ignore[no-untyped-def]
-    """All of the tallies but the rivals; winners by their `star_of`.
+    """Fill the vote results except rivals; winners are recorded by their `star_of`.
 
-    True where any star is ambiguous.
+    Returns true if any star is ambiguous.
     """
     votes = ballots.votes
     any_tie = False
@@ -390,7 +390,7 @@ def count_votes(ballots, star_of, tallies):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def name_rivals(votes, star_of, tallies):  # type: ignore[no-untyped-def]
-    """The rivals of the tallies: the `star_of` of those who share an ambiguous star's highest."""
+    """Fill the rivals of ambiguous stars: the `star_of` of all with the highest tally."""
     rivals = tallies.rivals
     rivals[:] = -1
     for i in range(votes.shape[0]):

@@ -1,7 +1,7 @@
-"""The identifier `starid`: pairs of stars vote, a unique maximum identifies.
+"""The identifier `starid`: pairs of stars vote for identities, and a unique maximum wins.
 
-A tie is ambiguous, no votes is unmatched, one vote is enough (Fink & Shoup
-1994; the paper counts unmatched stars among its ambiguous ones).
+A tie is ambiguous, no votes is unmatched, and one vote is enough (Fink & Shoup 1994; the paper
+counts unmatched stars as ambiguous).
 """
 
 import math
@@ -28,15 +28,15 @@ from service.sky.zones import Zone
 from service.vectors import Vector, angle_between_deg
 
 MAX_COMPARISONS = 30_000_000
-"""Observed with candidate pairs, for one tracker: a second or two."""
+"""Largest number of comparisons of observed with candidate pairs for one tracker: 1 to 2 s."""
 
 
 def identify_by_votes(
     which: Integers, seen: SightingColumns, zone: Zone, rules: Rules, found: IdentifiedColumns
 ) -> None:
-    """Identify stars by the votes of pairs, steps 1 to 10.
+    """Identify stars by the votes of pairs, steps 1 to 10 of STARID.
 
-    Of many sightings, `which` names the rows of those that the zone serves.
+    `which` has the row numbers of the sightings that the zone serves.
     """
     if rules.tests.match_groups:
         for s in which.tolist():
@@ -46,7 +46,9 @@ def identify_by_votes(
 
 
 def refuse_endless(direction: Vector, zone: Zone, rules: Rules) -> None:
-    """Raise `BadBatch` where so many stars (n, 3) at so wide a tolerance would take seconds."""
+    """Raise `BadBatch` if this many stars (n, 3) at this separation tolerance would take
+    seconds.
+    """
     n = len(direction)
     if n * (n - 1) // 2 * zone.pairs.count <= MAX_COMPARISONS:
         return
@@ -68,7 +70,7 @@ def refuse_endless(direction: Vector, zone: Zone, rules: Rules) -> None:
 
 
 def ballots_for(n: int, stars: int, edges: int = 0) -> Ballots:
-    """Empty ballots of n observed stars for so many zone stars."""
+    """Empty vote arrays for n observed stars and `stars` zone stars."""
     return Ballots(
         votes=np.zeros((n, stars), np.int32),
         voted=np.empty((n, stars), np.int32),
@@ -80,7 +82,7 @@ def ballots_for(n: int, stars: int, edges: int = 0) -> Ballots:
 def _tally_groups(
     s: int, seen: SightingColumns, zone: Zone, rules: Rules, found: IdentifiedColumns
 ) -> None:
-    """As `tally` for one sighting, of the votes of the largest match groups alone."""
+    """Count the votes of the largest match groups of one sighting; compare `tally`."""
     first, last = seen.offsets[s : s + 2].tolist()
     n, stars, left = last - first, len(zone.star), int(seen.left[s])
     sighted, bounds = sighted_at(seen, s), bounds_at(seen, s)
@@ -89,7 +91,7 @@ def _tally_groups(
     comparison = sighted, zone.arrays, polar, bounds, rulebook
     ballots = ballots_for(n, stars)
     compared = cast_votes(*comparison, ballots)
-    # For the edges of groups they are compared again.
+    # The comparisons are repeated to record the edges of groups.
     left = max(0, left - 2 * compared // COMPARISONS_PER_UNIT)
     bounded = compared > rulebook.max_comparisons
     if bounded:
