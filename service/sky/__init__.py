@@ -1,1 +1,1 @@
-"""The sky: star catalog, run catalogs, zones, pairs of stars, the Sun, and their cache."""
+"""The sky model: star catalog, run catalogs, zones, star pairs, the Sun, and a cache for them."""

@@ -1,7 +1,7 @@
-"""The one cache, of whatever is expensive to build and can be built again.
+"""A memory cache for objects that are expensive to build and can be built again.
 
-Least recently used things go first when the bound in bytes is passed.
-Concurrent requests for one key build it once: the others wait for the first.
+The least recently used entries are evicted first when the size limit is exceeded. Concurrent
+requests for one key build it once: the others wait for the first.
 """
 
 import threading
@@ -15,15 +15,15 @@ from typing import Generic, Protocol, TypeVar
 from service.errors import BeingBuilt
 
 BUILDS_AT_ONCE = 2
-"""A build may take many times the memory of its result."""
+"""Largest number of concurrent builds; each may take many times the memory of its result."""
 
 
 class Sized(Protocol):
-    """Anything that knows how many bytes it holds."""
+    """The protocol of objects that know their size in bytes."""
 
     @property
     def nbytes(self) -> int:
-        """Bytes held in memory."""
+        """The size of the object in memory, in bytes."""
         ...
 
 
@@ -31,12 +31,12 @@ T = TypeVar("T", bound=Sized)
 
 
 class NotAtHand(Exception):
-    """To get the thing would take long, and this caller must not wait."""
+    """An error: the item is not cached, and the caller must not wait for its build."""
 
 
 @dataclass
 class CacheEntry(Generic[T]):
-    """One cached thing, and its use so far."""
+    """One cached item, with the time of its build and its number of hits."""
 
     key: Hashable
     thing: T
@@ -46,7 +46,7 @@ class CacheEntry(Generic[T]):
 
 @dataclass(frozen=True)
 class CacheState:
-    """The state of a cache: its entries, least recently used first, and its counters."""
+    """A snapshot of a cache: its entries, least recently used first, and its counters."""
 
     entries: tuple[CacheEntry[Sized], ...]
     nbytes: int
@@ -59,7 +59,7 @@ class CacheState:
 
 @dataclass
 class LruCache:
-    """A cache bounded in bytes; safe to use from many threads."""
+    """A thread-safe cache of limited size that evicts the least recently used entries."""
 
     max_bytes: int
     _entries: "OrderedDict[Hashable, CacheEntry[Sized]]" = field(default_factory=OrderedDict)
@@ -81,12 +81,12 @@ class LruCache:
         find_builder: Callable[[], Executor | None] = lambda: None,
         wait: bool = True,
     ) -> tuple[T, bool]:
-        """The thing under `key`, built by `build` where it is missing, and whether it was there.
+        """The item under `key`, built by `build` if it is missing, and true if it was cached.
 
-        An error of `build` reaches every waiting caller and leaves nothing behind.
-        Where the thing is missing and `find_builder` gives a builder, the caller neither builds
-        nor waits: that builder builds it, unless this is under way, and `BeingBuilt` is raised.
-        Without `wait` what is missing is not built: `NotAtHand` is raised.
+        An error of `build` is raised for every waiting caller, and nothing is cached. If the item
+        is missing and `find_builder` returns a builder, the caller neither builds nor waits: that
+        builder starts the build, unless one is running, and `BeingBuilt` is raised. Without `wait`
+        a missing item is not built: `NotAtHand` is raised.
         """
         with self._lock:
             entry = self._entries.get(key)
@@ -94,7 +94,7 @@ class LruCache:
                 self._entries.move_to_end(key)
                 entry.hits += 1
                 self._hits += 1
-                # One cache holds things of several types; a key always names the same type.
+                # One cache holds items of several types; a key always has the same type.
                 return entry.thing, True  # type: ignore[return-value]
             if not wait:
                 raise NotAtHand
@@ -116,7 +116,7 @@ class LruCache:
         return promise.result(), True  # type: ignore[return-value]
 
     def _build(self, key: Hashable, build: Callable[[], Sized], promise: "Future[Sized]") -> None:
-        """Build a thing and keep the promise of it, which holds the error where there is one."""
+        """Build an item and fulfil its promise, with the error if the build fails."""
         try:
             with self._building_slots:
                 started = time.perf_counter_ns()
@@ -136,14 +136,14 @@ class LruCache:
         self._entries[entry.key] = entry
         self._nbytes += entry.thing.nbytes
         self._build_us += entry.build_us
-        # The newest stays even where it alone passes the bound: it is in use.
+        # The newest entry stays even if it alone exceeds the limit, since it is in use.
         while self._nbytes > self.max_bytes and len(self._entries) > 1:
             _, oldest = self._entries.popitem(last=False)
             self._nbytes -= oldest.thing.nbytes
             self._evictions += 1
 
     def drop(self, chosen: Callable[[Hashable], bool] = lambda key: True) -> int:
-        """Drop every entry whose key is chosen; how many there were."""
+        """Remove every entry whose key is chosen; returns the number removed."""
         with self._lock:
             keys = [key for key in self._entries if chosen(key)]
             for key in keys:
@@ -151,7 +151,7 @@ class LruCache:
         return len(keys)
 
     def state(self) -> CacheState:
-        """The present state."""
+        """A snapshot of the cache's entries and counters."""
         with self._lock:
             return CacheState(
                 tuple(self._entries.values()),

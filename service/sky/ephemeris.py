@@ -1,12 +1,10 @@
-"""The Sun, the planets and the observer's motion: directions as seen from a moving spacecraft.
+"""Ephemerides of the Sun and planets, the observer's velocity, and aberration.
 
-Velocities are barycentric, in units of the speed of light; positions and
-velocities of the spacecraft are geocentric; every axis is ICRS, with which
-EME2000 is taken as one.
+Velocities are barycentric, in units of the speed of light; positions and velocities of the
+spacecraft are geocentric; all axes are ICRS, which is taken to be EME2000.
 
-Planets are known to about half a minute of arc, from ERFA's `plan94`.  The series are Simon et
-al. (1994); the errors are those that ERFA's documentation gives for 1800 to 2100 against JPL's
-DE200.
+Planets are accurate to about half an arc minute, from ERFA's `plan94`. The series are Simon et al.
+(1994); the errors are those that ERFA's documentation gives for 1800 to 2100 against JPL's DE200.
 """
 
 import math
@@ -27,26 +25,26 @@ KM_PER_AU = erfa.DAU / 1000.0
 LIGHT_AU_PER_DAY = erfa.DAYSEC / erfa.AULT
 LIGHT_KM_PER_S = erfa.CMPS / 1000.0
 _ROUNDS_OF_ABERRATION = 3
-"""Each leaves 1e-4 of what was off before."""
+"""Iterations for removing aberration; each leaves 1e-4 of the previous error."""
 _STEPS_PER_DAY = 32
-"""Between so close places a cubic follows epv00 within 0.03 m and 1e-8 m/s."""
+"""Interpolation nodes per day: cubic interpolation is within 0.03 m and 1e-8 m/s of epv00."""
 
 
 EARTH_ORBIT_KM = 7_000.0
-"""How far from Earth's centre a spacecraft that gives no position is taken to be."""
+"""Largest distance from Earth's centre assumed for a spacecraft without a position, in km."""
 _ROUNDS_OF_LIGHT = 2
-"""After two the light time of Neptune is right within 1 us."""
+"""Iterations of light time; two are correct within 1 us for Neptune."""
 
 
-# By plain numbers: numpy takes longer for six than Python does.
+# Plain numbers are faster: numpy's overhead is larger for six numbers.
 @lru_cache(maxsize=64)
 def _earth(time: Utc) -> tuple[Triple, Triple, float]:
-    """Earth from the Sun in au, its barycentric velocity in c, and the Sun's distance in au."""
+    """Earth from the Sun in au, Earth's barycentric velocity in c, the Sun's distance in au."""
     tt1, tt2 = time.tt
     whole = (tt1 - erfa.DJ00) * _STEPS_PER_DAY
     number = math.floor(whole + tt2 * _STEPS_PER_DAY)
     at = (whole - number) + tt2 * _STEPS_PER_DAY
-    # Lagrange's weights for steps -1, 0, 1 and 2.
+    # Lagrange weights for nodes -1, 0, 1 and 2.
     before, after, beyond = at + 1.0, at - 1.0, at - 2.0
     a = -at * after * beyond / 6.0
     b = before * after * beyond / 2.0
@@ -58,7 +56,7 @@ def _earth(time: Utc) -> tuple[Triple, Triple, float]:
 
 @lru_cache(maxsize=256)
 def _about(number: int) -> list[list[float]]:
-    """Earth's six numbers, each at the steps from one before to two after a numbered one."""
+    """Earth's six coordinates, each at four nodes from one before to two after a node number."""
     numbers: list[list[float]] = np.stack(
         [_at(number + step) for step in (-1, 0, 1, 2)], axis=1
     ).tolist()
@@ -67,18 +65,17 @@ def _about(number: int) -> list[list[float]]:
 
 @lru_cache(maxsize=1024)
 def _at(number: int) -> Vector:
-    """Earth at a step: heliocentric place in au and barycentric velocity in c, (6,)."""
-    # epv00 asks for TDB, which differs from TT by under 2 ms.  Its status only
-    # tells that the date lies outside 1900 to 2100.
+    """Earth at one node: heliocentric position in au and barycentric velocity in c, (6,)."""
+    # epv00 expects TDB, which differs from TT by under 2 ms. Its status only flags dates outside of
+    # 1900 to 2100.
     heliocentric, barycentric, _ = ufunc.epv00(erfa.DJ00, number / _STEPS_PER_DAY)
     return np.concatenate([heliocentric["p"], barycentric["v"] / LIGHT_AU_PER_DAY])
 
 
 def observer_velocity(time: Utc, velocity_km_per_s: npt.ArrayLike | None) -> Vector:
-    """Velocity (3,) of the spacecraft about the barycentre, in units of c.
+    """The spacecraft's barycentric velocity (3,) in units of c.
 
-    Earth's velocity with the spacecraft's geocentric one added; Earth's alone
-    where the latter is None.
+    It is Earth's velocity plus the spacecraft's geocentric one, if that is not None.
     """
     u, v, w = _earth(time)[1]
     if velocity_km_per_s is None:
@@ -88,18 +85,20 @@ def observer_velocity(time: Utc, velocity_km_per_s: npt.ArrayLike | None) -> Vec
 
 
 def sun_distance_au(time: Utc) -> float:
-    """Distance from Earth to the Sun in astronomical units: near enough for a spacecraft's."""
+    """The distance from Earth to the Sun in au, accurate enough for a spacecraft."""
     return _earth(time)[2]
 
 
 def apparent(directions: npt.ArrayLike, velocity_c: Vector, time: Utc) -> Vector:
-    """Apparent unit vectors of geometric ones (..., 3), aberration applied by `erfa.ab`."""
+    """Apparent unit vectors of geometric ones (..., 3), with aberration by `erfa.ab`."""
     inverse_lorentz = float(np.sqrt(1.0 - velocity_c @ velocity_c))
     return np.asarray(ufunc.ab(directions, velocity_c, sun_distance_au(time), inverse_lorentz))
 
 
 def natural(directions: npt.ArrayLike, velocity_c: Vector, time: Utc) -> Vector:
-    """Geometric unit vectors of apparent ones (..., 3): `apparent` undone, within 1e-12 rad."""
+    """Geometric unit vectors of apparent ones (..., 3): the inverse of `apparent`, within 1e-12
+    rad.
+    """
     seen = np.asarray(directions, dtype=np.float64)
     found = seen
     for _ in range(_ROUNDS_OF_ABERRATION):
@@ -108,19 +107,19 @@ def natural(directions: npt.ArrayLike, velocity_c: Vector, time: Utc) -> Vector:
 
 
 def sun_direction(time: Utc, position_km: npt.ArrayLike | None) -> Vector:
-    """Unit vector (3,) from the spacecraft to the Sun, from Earth where no position is given."""
+    """The unit vector (3,) from the spacecraft to the Sun, or from Earth without a position."""
     sun_km = np.array(_earth(time)[0]) * -KM_PER_AU
     return unit_of(sun_km if position_km is None else sun_km - np.asarray(position_km))
 
 
 def ecliptic_north(time: Utc) -> Vector:
-    """Unit vector (3,) to the north pole of the mean ecliptic of date."""
+    """The unit vector (3,) to the north pole of the mean ecliptic of date."""
     return np.asarray(erfa.ecm06(*time.tt)[2])
 
 
 @dataclass(frozen=True)
 class Planet:
-    """A planet, its number in `plan94`, and the largest errors of its heliocentric place."""
+    """A planet with its number in `plan94`, and the largest errors of its heliocentric position."""
 
     name: str
     number: int
@@ -141,7 +140,7 @@ PLANETS = (
 
 @dataclass(frozen=True, eq=False)
 class PlanetPlace:
-    """Direction of a planet, a unit vector (3,), ICRS, and its largest error."""
+    """Direction of a planet as a unit vector (3,), ICRS, with its distance and largest error."""
 
     direction: Vector
     distance_au: float
@@ -149,11 +148,10 @@ class PlanetPlace:
 
 
 def planet_place(planet: Planet, time: Utc, position_km: Vector | None) -> PlanetPlace:
-    """A planet as seen from a spacecraft at a geocentric position, light time counted.
+    """A planet's place as seen from a geocentric position, corrected for light time.
 
-    The direction is the astrometric one, as that of catalog stars: without aberration.
-    Where no position is given the spacecraft may be anywhere in an orbit of
-    `EARTH_ORBIT_KM`, and the error says so.
+    The direction is the astrometric one, as that of catalog stars: without aberration. Without a
+    position the spacecraft may be anywhere within `EARTH_ORBIT_KM`, which enlarges the error.
     """
     tt1, tt2 = time.tt
     earth, _, _ = ufunc.epv00(tt1, tt2)

@@ -1,8 +1,8 @@
-"""Files of run catalogs and whole-sky indexes: one process builds each, every process maps it.
+"""Memory-mapped files of run catalogs and whole-sky indexes, built by one process for all.
 
-A file lies beside the compiled kernels, under the digest of all that it depends on.  Its content
-stands behind a digest of its own: a file that was cut or changed is removed and built again.  It is
-written under another name and then renamed, so that a file that can be opened is whole.
+Files are in the folder of compiled kernels, named by the digest of all inputs. A file begins with
+the digest of its content; a truncated or changed file is removed and built again. It is written
+under another name and then renamed, so that a file that can be opened is complete.
 """
 
 import fcntl
@@ -22,38 +22,38 @@ import numpy.typing as npt
 from service.compiled.cache import source_digest
 
 MOST_BYTES = 1 << 30
-"""In the folder: files that were not opened for longest are removed beyond it."""
+"""Largest total size of the folder; beyond it the least recently opened files are removed."""
 LINE = 64
-"""Arrays begin with a line of the processor's caches."""
+"""Alignment of arrays in a file, the size of a processor's cache line."""
 _START = 2 * LINE
-"""Offset of the head, after the digest of all that follows and the length of the head."""
+"""Offset of a file's head, after the digest of the rest and the length of the head."""
 _DIGEST = hashlib.sha256
 
 log = logging.getLogger(__name__)
 
 
 class Content(NamedTuple):
-    """The content of a file: what JSON can say of it, and arrays by name."""
+    """The content of a file: facts for JSON, and arrays by name."""
 
     facts: Mapping[str, Any]
     arrays: Mapping[str, npt.NDArray[Any]]
 
 
 def folder() -> Path:
-    """The folder of the files that this state of the source makes."""
+    """The folder for files made by the present state of the source code."""
     return Path(os.environ["NUMBA_CACHE_DIR"]) / f"sky-{source_digest()[:16]}"
 
 
 def is_kept(kind: str, key: Hashable) -> bool:
-    """True if there is a file of a kind and a key."""
+    """True if the file of a kind and a key exists."""
     return _path(kind, key).exists()
 
 
 def kept(kind: str, key: Hashable, build: Callable[[], Content]) -> Content:
-    """The content of the file of a kind and a key, its arrays mapped; built where there is none.
+    """The content of the file of a kind and a key, with mapped arrays; built if it does not exist.
 
-    Of several processes that need it one builds it, and the others wait.  Where no file can be
-    written, the content is what was built: each process has its own.
+    One of several processes builds the file, and the others wait. If no file can be written, each
+    process uses its own content as built.
     """
     path = _path(kind, key)
     content = _opened(path)
@@ -72,13 +72,14 @@ def _path(kind: str, key: Hashable) -> Path:
 
 
 def _opened(path: Path) -> Content | None:
-    """The content of a file; None where there is none, or a damaged one, which is removed."""
+    """The content of a file; None if it is missing or damaged, and then removed."""
     try:
         with path.open("rb") as file:
             np.lib.format.read_magic(file)
             np.lib.format.read_array_header_1_0(file)
             digest = file.read(LINE)[: _DIGEST().digest_size]
-            # Read, not mapped: pages count as a process's own from when it first looks at them.
+            # Read instead of mapped: mapped pages would count as the process's own memory from then
+            # on.
             is_whole = hashlib.file_digest(file, _DIGEST).digest() == digest
         if is_whole:
             with suppress(OSError):  # of another user, or not to be written
@@ -104,9 +105,9 @@ def _content(block: npt.NDArray[np.uint8]) -> Content:
 
 
 def _block(content: Content) -> npt.NDArray[np.uint8]:
-    """The bytes of a file: digest, length of the head, head, and one array after the other."""
+    """The bytes of a file: digest, length of the head, head, and the arrays one after another."""
     arrays = {name: np.ascontiguousarray(array) for name, array in content.arrays.items()}
-    # Its length depends on the places of the arrays, which begin behind it: there is room enough.
+    # The head's length depends on the offsets of the arrays that follow, so space is reserved.
     at = _aligned(_START + len(json.dumps(content.facts)) + 200 * (1 + len(arrays)))
     places = {}
     for name, array in arrays.items():
@@ -131,7 +132,7 @@ def _aligned(at: int) -> int:
 
 
 def _write(path: Path, content: Content) -> bool:
-    """Write a file under another name and rename it; False where that cannot be done."""
+    """Write a file under another name and rename it; false if that fails."""
     beside = path.with_suffix(".new")
     try:
         block = _block(content)
@@ -150,7 +151,7 @@ def _write(path: Path, content: Content) -> bool:
 
 
 def _make_room(place: Path, nbytes: int) -> None:
-    """Remove the files that were not opened for longest; who has them mapped keeps them."""
+    """Remove the least recently opened files; processes that have mapped them keep the content."""
     files = []
     for path in place.glob("*.npy"):
         with suppress(FileNotFoundError):  # removed by another process
@@ -166,7 +167,7 @@ def _make_room(place: Path, nbytes: int) -> None:
 
 @contextmanager
 def _alone(path: Path) -> Iterator[bool]:
-    """While the block runs no other process builds this file; False where that cannot be had."""
+    """Context manager that locks the build of a file for this process; yields false if it fails."""
     with ExitStack() as stack:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -181,7 +182,7 @@ def _alone(path: Path) -> Iterator[bool]:
 
 @cache
 def _warn(place: Path, reason: str) -> None:
-    """Say once that files cannot be kept."""
+    """Log a warning, once, that files cannot be stored."""
     log.warning(
         "the sky cannot be kept in %s (%s): each process builds its own, which takes seconds "
         "of its start and more memory",

@@ -1,4 +1,4 @@
-"""The sky of one batch: the run catalog of its epoch, and the zones in it."""
+"""The sky model: run catalogs for epochs, zones, and whole-sky indexes, all cached."""
 
 from collections.abc import Callable, Hashable
 from concurrent.futures import Executor
@@ -20,7 +20,7 @@ Kept = TypeVar("Kept", RunCatalog, SkyIndex)
 
 
 class RunCatalogKey(NamedTuple):
-    """What a run catalog depends on: its key in the cache and among the files."""
+    """The inputs of a run catalog: its key in the cache and among the files."""
 
     catalog: str
     settings: str
@@ -28,7 +28,7 @@ class RunCatalogKey(NamedTuple):
 
 
 class SkyIndexKey(NamedTuple):
-    """What an index of the whole sky depends on: its key in the cache and among the files."""
+    """The inputs of a whole-sky index: its key in the cache and among the files."""
 
     run_catalog: RunCatalogKey
     limit_mag: float
@@ -37,30 +37,31 @@ class SkyIndexKey(NamedTuple):
 
 @dataclass(frozen=True)
 class SkyModel:
-    """A star catalog, with the cache of all that is derived from it.
+    """A star catalog with a cache of everything derived from it.
 
-    Run catalogs and indexes of the whole sky are files, too: see `service.sky.files`.
+    Run catalogs and whole-sky indexes are also stored in files: see `service.sky.files`.
     """
 
     catalog: Catalog
     cache: LruCache
     require_whole_sky: Callable[[], None] = field(default=lambda: None, kw_only=True)
-    """Raises `Busy` while the kernels that search the whole sky are compiled."""
+    """A function that raises `Busy` while the kernels for whole-sky searches are being compiled."""
     builder: Executor | None = field(default=None, kw_only=True)
-    """What builds files that are not there yet: `BeingBuilt` is raised meanwhile.
+    """The executor that builds missing files, during which `BeingBuilt` is raised.
 
-    None: the caller does."""
+    None if the caller builds them.
+    """
     opens_files: bool = field(default=True, kw_only=True)
-    """False: everything is built anew, as where what builds it is to be compiled."""
+    """False if everything is built anew, for compiling the code that builds it."""
     waits: bool = field(default=True, kw_only=True)
-    """True: the model builds what is missing; False: it raises `NotAtHand` instead."""
+    """True if the model builds missing items; false if it raises `NotAtHand` instead."""
 
     def at_hand(self) -> "SkyModel":
-        """The same sky for who must not wait: what takes long raises `NotAtHand`."""
+        """A view of the sky that never builds anything: it raises `NotAtHand` instead."""
         return replace(self, waits=False, require_whole_sky=_not_at_hand)
 
     def run_catalog(self, mission: Mission, time: Utc) -> RunCatalog:
-        """The run catalog that serves a mission at a time: that of the nearest epoch."""
+        """The run catalog of a mission for the epoch nearest to a time."""
         settings = mission.run_catalog_settings
         epoch_year = mission.catalog.epoch_of(time.julian_year)
         key = RunCatalogKey(self.catalog.digest, settings.digest, epoch_year)
@@ -77,10 +78,10 @@ class SkyModel:
         build: Callable[[], Content],
         made_of: Callable[[Content], Kept],
     ) -> Kept:
-        """The thing that `made_of` makes of a file's content, from the cache."""
+        """The object that `made_of` makes from a file's content, through the cache."""
 
         def find_builder() -> Executor | None:
-            # To open a file takes less than to wait for another thread.
+            # Opening a file takes less time than waiting for another thread.
             return None if self.builder is None or is_kept(kind, key) else self.builder
 
         def make() -> Kept:
@@ -97,20 +98,20 @@ class SkyModel:
         separation_max_deg: float,
         grid_deg: float,
     ) -> tuple[Zone, bool]:
-        """The zone that serves a search region, and whether it was cached."""
+        """The zone that serves a search region, and true if it was cached."""
         asked = (mission.name, run_catalog, region, separation_max_deg, grid_deg)
         return zone_for(self.cache, *asked, wait=self.waits)
 
     def guide(self, run_catalog: RunCatalog, reach_deg: float) -> Guide:
-        """The guide database of PTP for trackers that see so far from their boresight."""
+        """The guide database of PTP for trackers with a field of view of a given radius."""
         key = GuideKey(run_catalog.digest, reach_deg, SLAVES)
         guide, _ = self.cache.get(key, lambda: build_guide(run_catalog, reach_deg))
         return guide
 
     def index(self, mission: Mission, run_catalog: RunCatalog, radius_deg: float) -> SkyIndex:
-        """The whole sky of a mission's run catalog, for fields of view of a radius.
+        """The whole-sky index of a mission's run catalog, for fields of view of a given radius.
 
-        Stars a little beyond the catalog's limit, which noise may show, are known to it.
+        It includes stars a little beyond the catalog's limit, which noise may make visible.
         """
         limit_mag = mission.catalog.magnitude_limit_mag
         settings = mission.run_catalog_settings
@@ -127,7 +128,7 @@ class SkyModel:
         return self._kept("whole-sky", key, build, SkyIndex.of_content)
 
     def drop_zones(self, mission: str | None = None) -> int:
-        """Drop the zones of a mission, or all, from the cache; how many there were."""
+        """Remove the zones of a mission, or all zones, from the cache; returns their number."""
         return self.cache.drop(
             lambda key: isinstance(key, ZoneKey) and mission in (None, key.mission)
         )

@@ -1,12 +1,11 @@
-"""Zone catalogs: the stars of a cap or of a band, with their pair index.
+"""Zone catalogs: the stars of a cap or a band of the sky, with their pair index.
 
 A zone is the set of stars whose angle to an axis lies between two bounds: a
 cap from zero to its radius, a band within its half width of the coelevation.
 
-The cache keeps zones whose axis is snapped to a grid and whose bounds are
-grown by what the snapping may move the axis.  The identifier then keeps only
-the stars within the bounds about the exact axis, so that the answer to a batch
-depends neither on the grid nor on the batches before it.
+Cached zones have their axis rounded to a grid and their bounds enlarged by the largest rounding
+error. The identifier then uses only the stars within the bounds about the exact axis, so that an
+answer depends neither on the grid nor on earlier batches.
 """
 
 import math
@@ -38,14 +37,14 @@ from service.vectors import (
     to_ra_dec,
 )
 
-# Keeps a star that stands on a bound within the grown zone through rounding.
+# Margin that keeps a star exactly on a bound within the enlarged zone despite rounding.
 _ROUNDING_DEG = 1e-9
-# How far a cosine must lie from that of a bound for rounding to leave no doubt.
+# Least difference of cosines from that of a bound that is safe from rounding.
 _CLEAR = 1e-12
 
 
 class SearchRegion(Struct, frozen=True, eq=False, gc=False):
-    """A region to search: an exact axis (3,), inertial, and the bounds on the angle to it."""
+    """A region of the sky to search: an exact inertial axis (3,), and bounds on the angle to it."""
 
     kind: str
     axis: Vector
@@ -53,7 +52,7 @@ class SearchRegion(Struct, frozen=True, eq=False, gc=False):
     most_deg: float
 
     def reaches_past(self, boresight: Vector, radius_deg: float) -> bool:
-        """True if a field of view about an inertial boresight goes beyond the bounds."""
+        """True if a field of view about an inertial boresight extends beyond the region."""
         angle = separation_deg(self.axis, boresight)
         return min(angle + radius_deg, 180.0) > self.most_deg or (
             self.least_deg > 0.0 and angle - radius_deg < self.least_deg
@@ -61,7 +60,7 @@ class SearchRegion(Struct, frozen=True, eq=False, gc=False):
 
 
 class ZoneArrays(NamedTuple):
-    """A zone of m stars and p pairs as kernels take it.
+    """A zone of m stars and p pairs in the form that kernels take.
 
     `direction` (m, 3), `magnitude` (m,), and `vector_mag` (m, 4) with both.
     `grid_start`, `grid_rows` and `grid_direction` are those of `StarBuckets`, `voxels`
@@ -90,11 +89,10 @@ class ZoneArrays(NamedTuple):
 class Zone:
     """The stars of a zone, brightest first, and their pairs.
 
-    `star` holds the rows in the run catalog, ascending; `direction` (n, 3) and
-    `magnitude_mag` belong to them, and `vector_mag` (n, 4) has either, for what
-    is read together.  In a band `polar_rad` (n,) are the stars'
-    angles to the axis, and `polar_difference_rad` (NTOT,) that of a pair's brighter
-    star less that of its dimmer, to a few digits; in a cap there are none.
+    `star` holds the rows in the run catalog, ascending; `direction` (n, 3) and `magnitude_mag`
+    belong to these, and `vector_mag` (n, 4) has both for joint access. In a band `polar_rad` (n,)
+    are the stars' angles to the axis, and `polar_difference_rad` (NTOT,) that of a pair's brighter
+    star less that of its dimmer, to a few digits; in a cap both are empty.
     """
 
     mission: str
@@ -113,7 +111,7 @@ class Zone:
 
     @property
     def nbytes(self) -> int:
-        """Bytes held."""
+        """The size of the zone in memory, in bytes."""
         parts = (
             *(self.star, self.direction, self.magnitude_mag, self.vector_mag, self.pairs),
             *(self.grid, self.voxels, self.polar_rad, self.polar_difference_rad),
@@ -122,7 +120,7 @@ class Zone:
 
     @cached_property
     def arrays(self) -> ZoneArrays:
-        """The zone as kernels take it."""
+        """The zone in the form that kernels take."""
         grid, pairs = self.grid, self.pairs
         return ZoneArrays(
             direction=self.direction,
@@ -150,7 +148,7 @@ class Zone:
         )
 
     def summary(self) -> dict[str, Any]:
-        """What the zone is, as the interface shows it."""
+        """A description of the zone for the interface."""
         ra_deg, dec_deg = to_ra_dec(self.region.axis)
         return {
             "kind": self.region.kind,
@@ -162,7 +160,7 @@ class Zone:
 
 
 class ZoneKey(NamedTuple):
-    """What a zone depends on: its key in the cache."""
+    """The inputs of a zone catalog: its key in the cache."""
 
     mission: str
     run_catalog: str
@@ -180,11 +178,11 @@ def build_zone(
     separation_max_deg: float,
     grid_deg: float = 0.0,
 ) -> Zone:
-    """Select the stars within a region and index their pairs."""
+    """The zone of the stars within a region, with their pair index."""
     cosine = run_catalog.direction @ region.axis
     low = math.cos(math.radians(min(180.0, region.most_deg + 1e-4)))
     high = math.cos(math.radians(max(0.0, region.least_deg - 1e-4)))
-    # The cosine chooses cheaply and generously, the accurate angle decides.
+    # The cosine preselects cheaply and generously; the accurate angle decides.
     near = (
         np.flatnonzero((cosine >= low) & (cosine <= high))
         if region.least_deg > 0
@@ -225,7 +223,7 @@ def _polar_angles(direction, axis, brighter, dimmer, polar, difference):  # type
 
 
 def counts_within(zone: Zone, region: SearchRegion) -> tuple[int, int]:
-    """How many of a zone's stars and pairs lie within a region that it serves."""
+    """The numbers of a zone's stars and pairs within a region that it serves."""
     one, found = np.zeros(1, np.int64), np.empty((1, 2), np.int64)
     least, most = math.radians(region.least_deg), math.radians(region.most_deg)
     count_within(zone, one, np.array((region.axis,)), np.array((least,)), np.array((most,)), found)
@@ -241,9 +239,9 @@ def count_within(
     most: Vector,
     found: npt.NDArray[np.int64],
 ) -> None:
-    """`counts_within` for those of k regions that `which` names, into its rows of `found` (k, 2).
+    """Count a zone's stars and pairs in the regions named by `which`, into rows of `found` (k, 2).
 
-    A region reaches from `least` to `most` (k,) radians from its `axis` (k, 3).
+    Regions reach from `least` to `most` (k,) radians from their `axis` (k, 3).
     """
     if zone.grid_deg == 0.0:
         found[which] = len(zone.star), zone.pairs.count
@@ -266,9 +264,10 @@ def _count_within(which, axes, leasts, mosts, direction, pair_rows, found):  # t
 
 @njit_no_refcount
 def _stars_inside(direction, axis, inner, outer, inside):  # type: ignore[no-untyped-def]
-    """Mark the stars (n, 3) with a cosine to the axis between two; whether one is near a bound.
+    """Mark the stars (n, 3) with a cosine to the axis between two bounds; true if one is near a
+    bound.
 
-    Then the accurate angles decide.  Without a branch several are looked at at a time.
+    In that case the accurate angles decide. Written without branches, to be vectorised.
     """
     is_near = False
     x, y, z = axis[0], axis[1], axis[2]
@@ -281,9 +280,9 @@ def _stars_inside(direction, axis, inner, outer, inside):  # type: ignore[no-unt
 
 @njit_no_refcount
 def _pairs_inside(one, other, inside):  # type: ignore[no-untyped-def]
-    """How many pairs, by the rows of their stars (p,), have both inside: 0 or 1 of each star (n,).
+    """The number of pairs, by the rows of their stars (p,), with both stars inside (n,), 0 or 1.
 
-    In words of 32 bits and by unsigned rows, so that sixteen pairs are looked up at a time.
+    With 32-bit words and unsigned rows, so that sixteen pairs are processed at a time.
     """
     pairs = np.int32(0)
     for k in range(len(one)):
@@ -301,7 +300,7 @@ def zone_for(
     *,
     wait: bool = True,
 ) -> tuple[Zone, bool]:
-    """The zone that serves a search region, cached or built, and whether it was cached.
+    """The zone that serves a search region, cached or built, and true if it was cached.
 
     Without `wait` it is not built: raises `NotAtHand`.
     """
@@ -322,7 +321,7 @@ def zone_key(
     separation_max_deg: float,
     grid_deg: float,
 ) -> ZoneKey:
-    """The key of the zone that serves a search region.
+    """The cache key of the zone that serves a search region.
 
     With a grid the zone's axis is the nearest grid point and its bounds are
     grown by half the diagonal of a grid cell; grid 0 is the exact zone.
@@ -346,7 +345,7 @@ def zone_key(
 
 
 def snapped(x: float, y: float, z: float, grid_deg: float) -> tuple[float, float, float]:
-    """The grid point nearest to a direction: rows of declination, each cut into equal steps.
+    """The grid point nearest to a direction, on rows of declination divided into equal steps.
 
     A step along a row is at most `grid_deg` of arc, so that no direction lies
     farther than grid_deg / sqrt(2) from its point.
@@ -354,7 +353,7 @@ def snapped(x: float, y: float, z: float, grid_deg: float) -> tuple[float, float
     ra_deg = math.degrees(math.atan2(y, x)) % 360.0
     dec_deg = math.degrees(math.atan2(z, math.hypot(x, y)))
     row_deg = round(dec_deg / grid_deg) * grid_deg
-    # The row's widest circle lies nearest to the equator, half a step from the row.
+    # The row's widest circle is nearest to the equator, half a step from the row.
     widest = max(0.0, abs(row_deg) - grid_deg / 2.0)
     steps = max(1, math.ceil(360.0 * math.cos(math.radians(widest)) / grid_deg))
     if abs(row_deg) >= 90.0:

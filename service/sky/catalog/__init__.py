@@ -1,1 +1,1 @@
-"""The star catalog, the run catalogs made from it, and how catalog files are read."""
+"""The star catalog, the run catalogs made from it, and readers of catalog files."""

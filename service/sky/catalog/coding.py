@@ -1,9 +1,8 @@
-"""The columns of a star catalog, and how a catalog file holds them.
+"""The columns of a star catalog, and their encoding in a catalog file.
 
-A catalog file is a zip of numpy arrays (.npz), one per column.  An integer
-array is a coded column: its value times the column's step, with one code kept
-for "unknown".  A floating-point array is taken as it is, so that a site's own
-catalog keeps its numbers to the last digit.
+A catalog file is a zip of numpy arrays (.npz), one per column. An integer array is a coded column:
+its value times the column's step, with one code kept for "unknown". A floating-point array is
+stored unchanged, so that a site's own catalog keeps its numbers to the last digit.
 """
 
 import hashlib
@@ -22,13 +21,13 @@ from service.errors import BadFile, Fault
 
 Column = npt.NDArray[Any]
 
-# The first moment a zip can name: a rebuild gives the same bytes.
+# The earliest date of a zip entry: fixed, so that a rebuild gives the same bytes.
 _ZIP_TIME = (1980, 1, 1, 0, 0, 0)
 
 
 @dataclass(frozen=True)
 class ColumnCoding:
-    """How one column is coded: value = integer times step; step None is a plain column."""
+    """Coding of one catalog column: value = integer times step; step None for a plain column."""
 
     meaning: str
     unit: str
@@ -37,7 +36,7 @@ class ColumnCoding:
     unknown: int | None = None
 
     def encode(self, values: Column) -> Column:
-        """Values as integers of the coding's type; NaN as the unknown code."""
+        """Column values as integers of the coding's type; NaN becomes the unknown code."""
         if self.step is None:
             return values.astype(self.dtype)
         nothing = np.isnan(values)
@@ -50,12 +49,14 @@ class ColumnCoding:
         return np.where(nothing, self.unknown or 0, coded).astype(self.dtype)
 
     def decode(self, stored: Column) -> Column:
-        """What `encode` was given, rounded to the step; a float column comes back as it is."""
+        """Column values from stored integers, to within the step; floating-point columns
+        unchanged.
+        """
         if self.step is None:
             return stored.astype(self.dtype)
         if stored.dtype.kind == "f":
             return stored.astype(np.float64)
-        # A division by the whole number 1/step gives 4.57 where 457 * 0.01 gives 4.570000000000001.
+        # Division by the whole number 1/step gives 4.57 where 457 * 0.01 gives 4.570000000000001.
         values = stored / round(1.0 / self.step) if self.step < 1.0 else stored * self.step
         if self.unknown is not None:
             values[stored == self.unknown] = np.nan
@@ -113,20 +114,20 @@ ALWAYS_KNOWN = (
 )
 
 LABEL = "label"
-"""An optional further column: the identifiers of a site's own catalog, as text."""
+"""The name of an optional column with the identifiers of a site's own catalog, as text."""
 
 
 def file_digest(data: bytes) -> str:
-    """The digest of a file's bytes as text, "sha256:…"."""
+    """The SHA-256 digest of a file's bytes as text, with the prefix "sha256:"."""
     return "sha256:" + hashlib.sha256(data).hexdigest()
 
 
 MAX_UNPACKED_BYTES = 1 << 30
-"""Some eight million stars: more than any catalog that trackers are run with."""
+"""Largest decompressed size of a catalog, about eight million stars."""
 
 
 def pack(columns: Mapping[str, Column]) -> bytes:
-    """A catalog file's bytes; the same columns always give the same bytes."""
+    """A catalog file as bytes; the same columns always give the same bytes."""
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w") as archive:
         for name, column in columns.items():
@@ -139,9 +140,9 @@ def pack(columns: Mapping[str, Column]) -> bytes:
 
 
 def _require_what_is_claimed(data: bytes) -> None:
-    """Raise `ValueError` for columns that claim to be larger than what is stored of them.
+    """Raise `ValueError` for columns that claim to be larger than their stored data.
 
-    The reader allocates what a column claims before it reads any of it.
+    numpy's reader allocates the claimed size of a column before it reads any data.
     """
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         entries = archive.infolist()
@@ -161,17 +162,16 @@ def _require_what_is_claimed(data: bytes) -> None:
 
 
 def unpack(data: bytes, path: Path) -> dict[str, Column]:
-    """The decoded columns of a catalog file's bytes; `path` is for the messages.
+    """The decoded columns of a catalog file's bytes; `path` is for error messages.
 
-    Raises BadFile naming the column that is missing, of another length or of
-    another kind.
+    Raises BadFile naming a column that is missing or of a wrong length or type.
     """
     try:
         _require_what_is_claimed(data)
         with np.load(io.BytesIO(data), allow_pickle=False) as archive:
             stored = {name: archive[name] for name in archive.files}
     except Exception as error:
-        # Both readers give up on damage in a dozen ways, each with an exception of its own.
+        # The readers fail on damaged files in many ways, with many kinds of exceptions.
         raise BadFile(Fault(str(path), f"not a star catalog file: {error!r}")) from error
     missing = [name for name in COLUMNS if name not in stored]
     if missing:

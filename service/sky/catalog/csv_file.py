@@ -1,4 +1,4 @@
-"""A site's own star catalog as CSV: read whole, or refused with every fault named."""
+"""Reader of a site's own star catalog in CSV: complete, or refused with every fault named."""
 
 import csv
 import math
@@ -16,12 +16,12 @@ from service.errors import BadFile, Fault, shown_value
 FAULTS_SHOWN = 20
 MAX_ID_LENGTH = 64
 FIRST_EPOCH, LAST_EPOCH = 1800.0, 2100.0
-"""Julian years between which the epoch of a position may lie."""
+"""Earliest and latest Julian year of a position's epoch."""
 
 
 @dataclass(frozen=True)
 class _NumberColumn:
-    """What a column of numbers may hold; `whole` numbers are those of other catalogs."""
+    """Allowed values of a numeric CSV column; `whole` numbers identify stars in other catalogs."""
 
     column: str
     least: float
@@ -47,16 +47,16 @@ OPTIONAL: Mapping[str, _NumberColumn] = {
     "hd": _NumberColumn("hd", 1, 2**31 - 1, 0, whole=True),
     "sao": _NumberColumn("sao", 1, 2**31 - 1, 0, whole=True),
 }
-"""Columns that may be left out, whole or star by star (an empty cell)."""
+"""Optional CSV columns, which may be missing or have empty cells."""
 _ALL = {**REQUIRED, **OPTIONAL}
 
 
 def read_csv_catalog(path: Path) -> dict[str, npt.NDArray[Any]]:
-    """The columns of a CSV catalog, by their names in a catalog, in the order of the file.
+    """The columns of a CSV catalog, by their names in a `Catalog`, in the order of the file.
 
-    `ra_deg` is in [0, 360), 360 itself being read as 0.  `epoch_year` is the Julian year of a
-    star's position, NaN where the file does not say.  Raises BadFile with
-    up to FAULTS_SHOWN faults, each with line, column and value.
+    `ra_deg` is in [0, 360), 360 itself being read as 0. `epoch_year` is the Julian year of a star's
+    position, NaN if missing. Raises BadFile with up to FAULTS_SHOWN faults, each with line, column
+    and value.
     """
     lines = _lines(path)
     header = [name.strip() for name in lines[0][1]]
@@ -95,7 +95,7 @@ def read_csv_catalog(path: Path) -> dict[str, npt.NDArray[Any]]:
 
 
 def _lines(path: Path) -> list[tuple[int, list[str]]]:
-    """Line number and cells of every line that is not blank; the header is the first."""
+    """The line numbers and cells of all lines that are not blank, beginning with the header."""
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -155,14 +155,14 @@ def _label_fault(label: str, seen: Mapping[str, int]) -> str | None:
 
 
 def _number(text: str, rule: _NumberColumn, *, required: bool) -> float | str:
-    """The cell's number, or what is wrong with it."""
+    """The number in a CSV cell, or a text that names its fault."""
     if not text and not required:
         return rule.absent
     try:
         value: float = int(text) if rule.whole else float(text)
     except ValueError:
         return "must be a whole number" if rule.whole else "must be a number"
-    # Also false for NaN.
+    # The comparison is also false for NaN.
     if not rule.least <= value <= rule.most:
         return f"must be between {rule.least:g} and {rule.most:g}"
     return value

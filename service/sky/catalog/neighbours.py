@@ -1,13 +1,13 @@
-"""The nearest neighbour of every star, and the nearest that could be mistaken for it."""
+"""The nearest neighbour of every star, and the nearest one bright enough to be confused with it."""
 
 import numpy as np
 
 from service.vectors import ARCSEC_PER_RADIAN, Vector
 
 REACH_ARCSEC = 3600.0
-"""A neighbour further away than this is not looked for."""
+"""Largest distance of a neighbour, in arcsec."""
 RIVAL_FAINTER_BY_MAG = 2.0
-"""A rival is a neighbour not more than this fainter than the star."""
+"""Largest number of magnitudes by which a rival neighbour may be fainter than the star."""
 
 _BIN_MAG = 0.5
 
@@ -15,12 +15,11 @@ _BIN_MAG = 0.5
 def nearest_neighbours(
     direction: Vector, magnitude: Vector, others: Vector, others_magnitude: Vector
 ) -> dict[str, Vector]:
-    """Distance and magnitude difference of each star's nearest neighbour and nearest rival.
+    """The distance and magnitude difference of each star's nearest neighbour and nearest rival.
 
-    Stars are unit vectors (N, 3) and magnitudes (N,); `others` (M, 3) are the
-    stars among which neighbours are sought, and hold the stars themselves as
-    their first N rows.  Gives four columns (N,) by their names in a catalog,
-    NaN where there is no neighbour within a degree.
+    Stars are unit vectors (N, 3) and magnitudes (N,); `others` (M, 3) are the possible neighbours,
+    with the stars themselves as the first N rows. Returns four columns (N,) by their names in a
+    catalog, NaN for no neighbour within a degree.
     """
     everyone = np.arange(len(others))
     columns = {}
@@ -28,8 +27,8 @@ def nearest_neighbours(
         direction, magnitude, np.arange(len(direction)), others, others_magnitude, everyone
     )
     distance, fainter = np.full((2, len(direction)), np.nan)
-    # Star by star the limit of the rival differs.  In bins of magnitude the search tree
-    # holds hardly more than the rivals, so that a few candidates per star suffice.
+    # The magnitude limit of a rival differs from star to star. In magnitude bins the search tree
+    # has hardly more than the rivals, so that a few candidates per star suffice.
     bins = np.floor(magnitude / _BIN_MAG)
     for lower in np.unique(bins):
         stars = np.flatnonzero(bins == lower)
@@ -55,9 +54,10 @@ def _nearest(
     sought: np.typing.NDArray[np.intp],
     fainter_by: float = np.inf,
 ) -> tuple[Vector, Vector]:
-    """Distance in arcsec and magnitude difference of the nearest of `sought` for each star.
+    """Distance in arcsec and magnitude difference of the nearest of the `sought` stars to each
+    star.
 
-    `own` is each star's row in `others`, which is no neighbour of itself.
+    `own` is each star's row in `others`, which is not its own neighbour.
     """
     from scipy.spatial import cKDTree
 
@@ -71,7 +71,7 @@ def _nearest(
         in_reach = np.isfinite(chord)
         other = sought[np.where(in_reach, place, 0)]
         difference = others_magnitude[other] - magnitude[waiting, None]
-        # Magnitudes are hundredths; 2.00 fainter still counts when the difference rounds up.
+        # Magnitudes are hundredths; a difference of 2.00 still counts when it rounds up.
         counts = in_reach & (other != own[waiting, None]) & (difference <= fainter_by + 1e-9)
         first = np.argmax(counts, axis=1)
         rows = np.arange(len(waiting))
@@ -80,7 +80,7 @@ def _nearest(
         half = chord[rows, first][found] / 2.0
         distance[star] = 2.0 * np.arcsin(half) * ARCSEC_PER_RADIAN
         fainter[star] = difference[rows, first][found]
-        # All candidates within reach were turned down, and there may be more of them.
+        # All candidates within reach were rejected, and there may be more of them.
         waiting = waiting[~found & in_reach[:, -1]]
         count *= 4
     return distance, fainter

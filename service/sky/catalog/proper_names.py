@@ -1,4 +1,4 @@
-"""Proper names of bright stars, as the IAU has approved them, by their numbers in Hipparcos."""
+"""Proper names of bright stars, as approved by the IAU, by Hipparcos number."""
 
 PROPER_NAMES = {
     677: "Alpheratz",

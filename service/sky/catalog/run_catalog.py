@@ -1,13 +1,12 @@
-"""The run catalog: the stars that a mission's identifier uses, as they stand in one year.
+"""The run catalog: the stars that a mission's identifier uses, at the epoch of one year.
 
-It is made from the star catalog in five steps: proper motion to the epoch,
-instrument magnitude, merging of what the tracker cannot separate, the
-magnitude limit, and rejection.  Index order, brightest first, is the
-brightness rank that the pair index uses.
+It is made from the star catalog in five steps: proper motion to the epoch, instrument magnitude,
+merging of stars that the tracker cannot separate, the magnitude limit, and rejection. Index order,
+brightest first, is the brightness rank that the pair index uses.
 
-The catalog's own directions are those seen from the solar system's barycentre at
-its epoch, and zones are made of them.  `direction_at` gives those seen from the
-Earth on the day of a batch, of which attitudes and residuals are made.
+The catalog's own directions are those seen from the solar system's barycentre at its epoch, and are
+used for zones. `direction_at` gives the directions seen from the Earth on the day of a batch, used
+for attitudes and residuals.
 """
 
 import hashlib
@@ -30,7 +29,7 @@ from service.times import Utc
 from service.vectors import ARCSEC_PER_RADIAN, Vector, from_ra_dec, read_only, to_ra_dec, unit
 
 UNKNOWN_COLOR_BV_MAG = 0.6
-"""The B-V of a star whose colour is not known: a Sun-like one, near the catalog's median."""
+"""Colour index B-V assumed for a star of unknown colour: Sun-like, near the catalog's median."""
 
 J2000_YEAR, J2000_JD, DAYS_PER_YEAR = 2000.0, 2451545.0, 365.25
 _ARRAYS = ("ra_deg", "dec_deg", "motion", "parallax_rad", "magnitude_mag", "catalog_row")
@@ -39,7 +38,7 @@ Rows = npt.NDArray[np.intp]
 
 @dataclass(frozen=True)
 class Rejection:
-    """A star that is left out though it is bright enough, and why."""
+    """A star that is bright enough for the run catalog but left out, with the reason."""
 
     star_id: str
     reason: str
@@ -47,21 +46,25 @@ class Rejection:
 
 @dataclass(frozen=True, eq=False)
 class RunCatalog:
-    """The stars of a run in index order: by instrument magnitude, ties by catalog row.
+    """The stars of a run catalog by instrument magnitude, brightest first, ties by catalog row.
 
-    Arrays have one entry per star and are locked against writing.
+    Arrays have one entry per star and are read-only.
     """
 
     epoch_year: float
     ra_deg: Vector
     dec_deg: Vector
-    """ICRS at the epoch.  These numbers are exported, and `direction` is computed from them."""
+    """Right ascension and declination, ICRS at the epoch; exported, and the source of
+    `direction`.
+    """
     motion: Vector
-    """Change of the directions in a Julian year (N, 3), radians; the light's for merged stars."""
+    """Change of the unit vectors per Julian year (N, 3), radians; flux-weighted for merged
+    stars.
+    """
     parallax_rad: Vector
-    """Zero where it is not known, or was measured below zero."""
+    """Parallaxes in radians; zero if unknown or negative."""
     magnitude_mag: Vector
-    """Instrument magnitude, of the combined light where stars were merged."""
+    """Instrument magnitudes; of the combined light for merged stars."""
     catalog_row: Rows
     star_id: tuple[str, ...]
     rejected: tuple[Rejection, ...]
@@ -73,14 +76,14 @@ class RunCatalog:
 
     @property
     def nbytes(self) -> int:
-        """Bytes held, the identifiers estimated."""
+        """The size of the run catalog in memory in bytes, with identifiers estimated."""
         arrays = [self.ra_deg, self.dec_deg, self.magnitude_mag, self.direction, self.motion]
         floats = sum(array.nbytes for array in (*arrays, self.parallax_rad))
         return floats + self.catalog_row.nbytes + 64 * len(self.star_id)
 
     @property
     def content(self) -> Content:
-        """The content of its file."""
+        """The run catalog as the content of a file."""
         facts = {
             "epoch_year": self.epoch_year,
             "digest": self.digest,
@@ -91,7 +94,7 @@ class RunCatalog:
 
     @classmethod
     def of_content(cls, content: Content) -> "RunCatalog":
-        """The run catalog that a file holds."""
+        """A run catalog from the content of a file."""
         facts, arrays = content
         return cls(
             epoch_year=facts["epoch_year"],
@@ -103,21 +106,20 @@ class RunCatalog:
 
     @cached_property
     def direction(self) -> Vector:
-        """Unit vectors (N, 3) of exactly `ra_deg` and `dec_deg`."""
+        """Unit vectors (N, 3) computed exactly from `ra_deg` and `dec_deg`."""
         return read_only(from_ra_dec(self.ra_deg, self.dec_deg))
 
     def direction_at(self, time: Utc) -> Vector:
-        """Unit vectors (N, 3) as seen from the Earth on the day of a time, without aberration.
+        """Unit vectors (N, 3) seen from the Earth on the day of a time, without aberration.
 
-        Proper motion and annual parallax within the day are left out: below 0.02 arcsec for
-        every star.
+        Motion and parallax within the day are ignored: below 0.02 arcsec for every star.
         """
         return _on_day(self, round(time.julian_year * DAYS_PER_YEAR))
 
 
 @lru_cache(maxsize=32)
 def _on_day(run_catalog: RunCatalog, day: int) -> Vector:
-    """The directions of a run catalog on a day, counted from Julian year 0."""
+    """The directions of a run catalog's stars on a day, counted from Julian year 0."""
     year = day / DAYS_PER_YEAR
     _, of_earth, _ = ufunc.epv00(J2000_JD, DAYS_PER_YEAR * (year - J2000_YEAR))
     seen = run_catalog.direction + (year - run_catalog.epoch_year) * run_catalog.motion
@@ -128,10 +130,10 @@ def _on_day(run_catalog: RunCatalog, day: int) -> Vector:
 def build_run_catalog(
     catalog: Catalog, settings: RunCatalogSettings, epoch_year: float
 ) -> RunCatalog:
-    """The run catalog of a mission's settings and of an epoch in Julian years, e.g. 1996.0.
+    """The run catalog for a mission's settings at an epoch in Julian years, e.g. 1996.0.
 
-    `rejected` lists, in catalog order, every star that is bright enough and
-    yet no entry: merged into a brighter one, or rejected.
+    `rejected` lists, in catalog order, every star that is bright enough but has no entry: merged
+    into a brighter one, or rejected.
     """
     alone = instrument_magnitude(catalog, settings.color_polynomial_mag)
     known = (
@@ -179,9 +181,10 @@ def build_run_catalog(
 
 
 def instrument_magnitude(catalog: Catalog, color_polynomial_mag: Sequence[float]) -> Vector:
-    """V + c0 + c1 (B-V) + c2 (B-V)^2 + … for every star; without coefficients V itself.
+    """Instrument magnitudes V + c0 + c1 (B-V) + c2 (B-V)^2 + … of all stars; V without
+    coefficients.
 
-    A star of unknown colour is given UNKNOWN_COLOR_BV_MAG.
+    A star of unknown colour gets UNKNOWN_COLOR_BV_MAG.
     """
     if not color_polynomial_mag:
         return catalog.magnitude_v_mag
@@ -191,7 +194,9 @@ def instrument_magnitude(catalog: Catalog, color_polynomial_mag: Sequence[float]
 
 
 def export_csv(run_catalog: RunCatalog, path: Path) -> None:
-    """Writes `id,ra_deg,dec_deg,magnitude` in index order, numbers that read back exactly."""
+    """Write a run catalog to CSV, `id,ra_deg,dec_deg,magnitude` in index order, with exact
+    numbers.
+    """
     rows = zip(
         map(neutralised, run_catalog.star_id),
         run_catalog.ra_deg.tolist(),
@@ -203,7 +208,7 @@ def export_csv(run_catalog: RunCatalog, path: Path) -> None:
 
 
 def export_rejected_csv(run_catalog: RunCatalog, path: Path) -> None:
-    """Writes `id,reason` of every rejected star, in catalog order."""
+    """Write `id,reason` of every rejected star to CSV, in catalog order."""
     rows = [(neutralised(one.star_id), one.reason) for one in run_catalog.rejected]
     _write_csv(path, [("id", "reason"), *rows])
 
@@ -221,10 +226,10 @@ def rejections(
     leads: npt.NDArray[np.bool_],
     judged: npt.NDArray[np.bool_],
 ) -> dict[int, str]:
-    """Row and reason of every star of `judged` that is rejected; a merged one by its leader.
+    """The catalog rows of the `judged` stars that are rejected, each with the reason.
 
-    A property that the catalog does not tell rejects no star.  Of several reasons the
-    first is given.
+    A merged star is rejected with its leader. An unknown property rejects no star. Of several
+    reasons the first is given.
     """
     reasons: dict[int, str] = {}
     amplitude, sigma = settings.reject_variable_amplitude_mag, settings.reject_position_sigma_arcsec
@@ -248,11 +253,10 @@ def _nearest_disturbing(
     magnitude: Vector,
     leads: npt.NDArray[np.bool_],
 ) -> Vector:
-    """Distance in arcsec of each star's nearest disturbing neighbour; infinite where there is none.
+    """Distance in arcsec of each star's nearest disturbing neighbour; infinite without one.
 
-    Neighbours are the other stars of the catalog after merging and, for those
-    fainter than the catalog, the two of which the catalog holds the distance;
-    one within the merging distance is part of the star.
+    Neighbours are the other catalog stars after merging and, for fainter stars, the two neighbours
+    whose distance the catalog records; a neighbour within the merging distance is part of the star.
     """
     within = settings.reject_neighbour_within_arcsec
     fainter = settings.reject_neighbour_fainter_by_mag
@@ -281,12 +285,11 @@ def merged_into(
     light_elsewhere: npt.NDArray[np.bool_],
     within_arcsec: float,
 ) -> Rows:
-    """For every star (N,) the row of the star it is merged into: itself where it stands alone.
+    """For every star (N,) the row of the star into which it is merged: its own row if it is single.
 
-    From the brightest down, a star that is still alone takes in every fainter
-    one that is still alone and not further than `within_arcsec` from it;
-    chains end there.  Stars whose light is elsewhere come last, so that none
-    of them leads a real one.
+    From the brightest down, a star that is not merged yet absorbs every fainter one that is not
+    merged yet and within `within_arcsec`; chains end there. Components whose light is part of
+    another entry come last, so that they absorb no real star.
     """
     leader = np.arange(len(magnitude))
     if within_arcsec > 0.0:
@@ -302,7 +305,7 @@ def merged_into(
 
 
 def pairs_within(direction: Vector, within_arcsec: float) -> Rows:
-    """The pairs (P, 2) of rows not further apart than some arcsec."""
+    """The pairs (P, 2) of rows of stars within a number of arcsec from each other."""
     pairs = build_pairs(direction, within_arcsec / 3600.0)
     return np.stack([pairs.brighter, pairs.dimmer], axis=1).astype(np.intp)
 
@@ -310,11 +313,10 @@ def pairs_within(direction: Vector, within_arcsec: float) -> Rows:
 def combined(
     direction: Vector, magnitude: Vector, light_elsewhere: npt.NDArray[np.bool_], leader: Rows
 ) -> tuple[Vector, Vector]:
-    """Directions (N, 3), not normalised, and magnitudes after merging.
+    """Directions (N, 3), not normalised, and magnitudes of stars after merging.
 
-    Further columns of `direction`, such as motions, are combined alike.  A leader has
-    the light of its group and stands in the group's centre of light; every other star
-    is as it was.
+    Further columns of `direction`, such as motions, are combined alike. A leader gets the light of
+    its group and the group's centre of light; other stars are unchanged.
     """
     direction, magnitude = direction.copy(), magnitude.copy()
     lost = np.flatnonzero((leader != np.arange(len(leader))) & ~light_elsewhere)

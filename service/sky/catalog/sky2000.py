@@ -1,9 +1,8 @@
-"""SKYMAP's SKY2000 Master Catalog as fixed-width records (CDS V/109, sky2kv4.dat).
+"""Reader of SKYMAP's SKY2000 Master Catalog, fixed-width records (CDS V/109, sky2kv4.dat).
 
-A table says which bytes hold what, by the byte-by-byte description that comes
-with the catalog (Myers and others 2002); the reader knows nothing but the
-table.  Records are read whole, or the file is refused with every fault named.
-The Skymap number stays the star's id.
+A table defines the bytes of each field, after the byte-by-byte description that comes with the
+catalog (Myers and others 2002). A file with any faulty record is refused with every fault named.
+The Skymap number is the star's id.
 """
 
 import gzip
@@ -25,7 +24,7 @@ from service.sky.catalog.csv_file import FAULTS_SHOWN
 DESIGNATION = b"SKY2000"
 RECORD_BYTES = 520
 LEAST_BYTES = 243
-"""A record may end after its magnitudes, where its trailing blanks were cut off."""
+"""Least length of a record: it may end after its magnitudes if trailing blanks were removed."""
 MAX_STARS = 8_000_000
 GZIP = b"\x1f\x8b"
 
@@ -35,9 +34,9 @@ _DECIMAL = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)")
 
 @dataclass(frozen=True)
 class RecordField:
-    """Bytes `first` to `last`, from 1, of a record: a number within bounds, or blank.
+    """Numeric field of a catalog record: bytes `first` to `last`, from 1, within bounds, or blank.
 
-    `label` is the description's own.  `must` be there, or may be blank.
+    `label` is that of the catalog's description. A field with `must` may not be blank.
     """
 
     label: str
@@ -49,8 +48,8 @@ class RecordField:
     must: bool = False
 
     def read(self, record: str) -> float | None:
-        """The number, None where the bytes are blank; raises `ValueError` saying what is wrong."""
-        # Signs stand in the first of their bytes, and the digits may stand off to the right.
+        """The number in a record's field, None if blank; raises `ValueError` with the fault."""
+        # Signs are in the first byte of a field, while the digits may be right-aligned.
         text = record[self.first - 1 : self.last].strip()
         text = re.sub(r"^([+-])\s+", r"\1", text)
         if not text:
@@ -74,7 +73,7 @@ FIELDS: Mapping[str, RecordField] = {
         RecordField("SAO", 44, 49, 1, 999_999, whole=True),
         RecordField("RAh", 119, 120, 0, 23, whole=True, must=True),
         RecordField("RAm", 121, 122, 0, 59, whole=True, must=True),
-        # Sixty seconds, from rounding, are in the catalog.
+        # The catalog has sixty seconds, from rounding.
         RecordField("RAs", 123, 129, 0.0, 60.0, must=True),
         RecordField("DEd", 131, 132, 0, 90, whole=True, must=True),
         RecordField("DEm", 133, 134, 0, 59, whole=True, must=True),
@@ -94,21 +93,21 @@ FIELDS: Mapping[str, RecordField] = {
     )
 }
 DECLINATION_SIGN, BLENDED_V = 130, 249
-"""Bytes of the two marks that are read: the sign of the declination, and `b` for blended light."""
+"""Bytes of two flags: the sign of the declination, and `b` for blended light."""
 
 CatalogRecord = dict[str, float | None]
 
 
 @dataclass(frozen=True)
 class Read:
-    """The columns of a catalog, by its names, and the stars that have no visual magnitude."""
+    """The columns of a SKY2000 catalog, and the stars that have no visual magnitude."""
 
     columns: dict[str, npt.NDArray[Any]]
     without_magnitude: tuple[str, ...]
 
 
 def is_sky2000(path: Path) -> bool:
-    """True if a file begins as a SKY2000 catalog does, compressed or not."""
+    """True if a file begins like a SKY2000 catalog, compressed or not."""
     try:
         with _opened(path) as file:
             return file.read(len(DESIGNATION)) == DESIGNATION
@@ -117,12 +116,11 @@ def is_sky2000(path: Path) -> bool:
 
 
 def read_sky2000(path: Path, step: Callable[[], object] = lambda: None) -> Read:
-    """The stars of a file, in its order; `step` is called after each record.
+    """The stars of a SKY2000 file, in its order; `step` is called after each record.
 
-    The observed V, or where there is none the derived one, is the magnitude; a
-    star with neither is left out and listed.  Of a star whose light is blended
-    the components that are records of their own have their light elsewhere.
-    Raises BadFile with up to FAULTS_SHOWN faults, each with line, bytes and value.
+    The magnitude is the observed V, or else the derived one; a star with neither is left out and
+    listed. Components of a blended star with records of their own are marked as having their light
+    elsewhere. Raises BadFile with up to FAULTS_SHOWN faults, each with line, bytes and value.
     """
     faults: list[Fault] = []
     stars: list[CatalogRecord] = []
@@ -166,11 +164,11 @@ def _opened(path: Path) -> BufferedIOBase:
 
 
 def _records(path: Path, faults: list[Fault]) -> Iterator[tuple[int, str]]:
-    """Line number and text of each record that has the right length; blank lines are passed by."""
+    """Line numbers and texts of records of the right length; blank lines are skipped."""
     line = 0
     try:
         with _opened(path) as file:
-            # Never more than a record at a time, whatever a damaged file holds.
+            # Never more than a record at a time, whatever a damaged file contains.
             while raw := file.readline(RECORD_BYTES + 3):
                 line += 1
                 text = raw.rstrip(b"\r\n")
@@ -208,7 +206,7 @@ def _fault(line: int, field: RecordField, message: str, record: str) -> Fault:
 
 
 def _values(line: int, record: str, faults: list[Fault]) -> CatalogRecord | None:
-    """The numbers of a record with its position in degrees; None where anything is wrong."""
+    """The numbers of a record with its position in degrees; None if any is faulty."""
     before = len(faults)
     found: CatalogRecord = {}
     for label, field in FIELDS.items():
@@ -254,7 +252,7 @@ def _columns(stars: list[CatalogRecord], blended: list[bool]) -> dict[str, npt.N
         "label": np.array([f"SKYMAP {each}" for each in number.tolist()]),
         "ra_deg": column("ra_deg"),
         "dec_deg": dec_deg,
-        # Seconds of time a year at the star's own declination, and seconds of arc.
+        # Seconds of time per year at the star's declination, and seconds of arc.
         "pm_ra_mas_per_year": 15_000.0 * column("pmRA", 0.0) * np.cos(np.radians(dec_deg)),
         "pm_dec_mas_per_year": 1000.0 * column("pmDE", 0.0),
         "parallax_mas": 1000.0 * column("Plx"),
@@ -274,7 +272,7 @@ def _columns(stars: list[CatalogRecord], blended: list[bool]) -> dict[str, npt.N
 def _elsewhere(
     stars: list[CatalogRecord], number: npt.NDArray[np.int64], blended: list[bool]
 ) -> npt.NDArray[np.bool_]:
-    """Which stars' light is in the blended magnitude of another: its fainter components."""
+    """True for stars whose light is in the blended magnitude of another: its fainter components."""
     row_of = {int(each): row for row, each in enumerate(number)}
     elsewhere = np.zeros(len(stars), np.bool_)
     for row, star in enumerate(stars):
@@ -283,7 +281,7 @@ def _elsewhere(
         own = (star["V"], row)
         for label in ("ID_A", "ID_B", "ID_C"):
             other = row_of.get(int(star[label] or 0))
-            # Of two records with the same blended light the first keeps it.
+            # Of two records with the same blended light the first keeps the light.
             if other is not None and (stars[other]["V"], other) > own:
                 elsewhere[other] = True
     return elsewhere

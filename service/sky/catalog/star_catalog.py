@@ -1,8 +1,7 @@
 """The star catalog: positions and motions at J2000.0, magnitudes, neighbours, identifiers.
 
-The embedded catalog is complete to V 9.0 and travels with the service (see
-`catalogs/README.md`); a site may bring its own.  A catalog is the sky as it is
-known; what a mission's identifier uses is made from it in
+The embedded catalog is complete to V 9.0 and travels with the service (see `catalogs/README.md`); a
+site may bring its own. A mission's identifier uses a run catalog made from it, see
 `service.sky.catalog.run_catalog`.
 """
 
@@ -38,51 +37,56 @@ POSITION_AND_MOTION = ("ra_deg", "dec_deg", "pm_ra_mas_per_year", "pm_dec_mas_pe
 
 @dataclass(frozen=True, eq=False)
 class Catalog:
-    """A star catalog; every array has one entry per star and is locked against writing.
+    """A star catalog as read-only arrays with one entry per star.
 
-    Rows are sorted by V, brightest first, ties in a fixed order.  Positions
-    are ICRS at J2000.0 (epoch and, within 0.02 arcsec, equinox).  Magnitudes
-    and colours, neighbours and sigmas are NaN where they are not known;
-    numbers of other catalogs are 0 where there is none.
+    Rows are sorted by V, brightest first, ties in a fixed order. Positions are ICRS at J2000.0
+    (epoch and, within 0.02 arcsec, equinox). Unknown magnitudes, colours, neighbours and sigmas are
+    NaN; missing numbers of other catalogs are 0.
     """
 
     name: str
     digest: str
-    """Digest of the file that the catalog was read from, "sha256:…"."""
+    """Digest of the file from which the catalog was read, "sha256:…"."""
     ra_deg: Vector
     dec_deg: Vector
     pm_ra_mas_per_year: Vector
-    """Times cos(declination): the length of an arc."""
+    """Proper motion in right ascension times cos(declination), as an arc, mas per year."""
     pm_dec_mas_per_year: Vector
     parallax_mas: Vector
     magnitude_v_mag: Vector
     color_bv_mag: Vector
     neighbour_arcsec: Vector
-    """Nearest neighbour of any magnitude known; NaN: none within a degree."""
+    """Distance of the nearest neighbour of any known magnitude; NaN for none within a degree."""
     neighbour_fainter_by_mag: Vector
-    """The neighbour's V minus the star's: negative where the neighbour is brighter."""
+    """The neighbour's V minus the star's: negative for a brighter neighbour."""
     rival_arcsec: Vector
-    """Nearest neighbour not more than 2 mag fainter than the star; NaN: none within a degree."""
+    """Distance of the nearest neighbour at most 2 mag fainter; NaN for none within a degree."""
     rival_fainter_by_mag: Vector
     variability_mag: Vector
-    """Amplitude between brightest and faintest; NaN: not known to vary."""
+    """Amplitude of variability in magnitudes, from brightest to faintest; NaN if not known to
+    vary.
+    """
     position_sigma_arcsec: Vector
     components: npt.NDArray[np.uint8]
     light_elsewhere: npt.NDArray[np.bool_]
-    """The star's light is already in a neighbour's magnitude: blending must not add it again."""
+    """True if a neighbour's magnitude includes the star's light, which merging must not add
+    again.
+    """
     hip: npt.NDArray[np.int32]
     tyc: npt.NDArray[np.uint16]
     hd: npt.NDArray[np.int32]
     sao: npt.NDArray[np.int32]
     label: npt.NDArray[np.str_] | None = None
-    """Identifiers of a site's own catalog, e.g. "SKYMAP 1234"; None: HIP or TYC names the star."""
+    """Identifiers of a site's own catalog, e.g. "SKYMAP 1234"; None if stars have HIP or TYC
+    numbers.
+    """
 
     def __len__(self) -> int:
         return len(self.ra_deg)
 
     @cached_property
     def direction(self) -> Vector:
-        """Unit vectors (N, 3), ICRS at J2000.0."""
+        """Unit vectors (N, 3) of the catalog's stars, ICRS at J2000.0."""
         return read_only(from_ra_dec(self.ra_deg, self.dec_deg))
 
     def star_id(self, row: int) -> str:
@@ -90,7 +94,7 @@ class Catalog:
         return self.star_ids([row])[0]
 
     def star_ids(self, rows: Sequence[int] | npt.NDArray[np.intp] | slice) -> list[str]:
-        """The identifiers of many stars, in the order asked for."""
+        """The identifiers of many stars, in the order of the rows."""
         if self.label is not None:
             return [str(text) for text in self.label[rows]]
         numbers = zip(self.hip[rows].tolist(), self.tyc[rows].tolist(), strict=True)
@@ -101,7 +105,7 @@ class Catalog:
         return {star_id: row for row, star_id in enumerate(self.star_ids(slice(None)))}
 
     def row_of(self, star_id: str) -> int:
-        """The row of an identifier; NotFound where the catalog has no such star."""
+        """The catalog row of a star's identifier; raises NotFound for an unknown one."""
         row = self._row_of.get(star_id)
         if row is None:
             raise NotFound(f"star {star_id!r} is not in catalog {self.name}")
@@ -119,9 +123,9 @@ def _catalog(name: str, digest: str, columns: Mapping[str, npt.NDArray[Any]]) ->
 
 
 def load(path: Path) -> Catalog:
-    """The catalog of a file that `save` or the build wrote; its name is the file's stem.
+    """The catalog in a file written by `save` or the build; its name is the file's stem.
 
-    Raises BadFile where the file is missing or damaged.
+    Raises BadFile if the file is missing or damaged.
     """
     try:
         data = path.read_bytes()
@@ -134,12 +138,12 @@ def load(path: Path) -> Catalog:
 
 @cache
 def load_embedded() -> Catalog:
-    """The catalog that travels with the service, read once."""
+    """The catalog that comes with the service, read once."""
     return load(shipped("catalogs", "stars.npz"))
 
 
 def open_catalog(file: Path | None) -> Catalog:
-    """The site's catalog, or the embedded one; raises `BadConfiguration` where it is damaged."""
+    """The site's catalog, or else the embedded one; raises `BadConfiguration` if it is damaged."""
     if file is None:
         return load_embedded()
     try:
@@ -151,17 +155,17 @@ def open_catalog(file: Path | None) -> Catalog:
 def import_csv(path: Path, epoch_year: float = J2000_YEAR) -> Catalog:
     """A site's own catalog from a CSV file with a header.
 
-    Columns `id`, `ra_deg`, `dec_deg` and `magnitude` must be there; those of
-    `service.sky.catalog.csv_file.OPTIONAL` may be.  Positions are ICRS at the Julian year of
-    the column `epoch`, without one at `epoch_year`; proper motion carries them to J2000.0.
-    Proper motion in right ascension is times cos(declination), as in Hipparcos and Gaia.
-    Stars of equal magnitude keep the order of the file.  Neighbours are found within the
-    catalog itself.  Raises BadFile naming line, column and value of up to twenty faults.
+    Columns `id`, `ra_deg`, `dec_deg` and `magnitude` are required; those of
+    `service.sky.catalog.csv_file.OPTIONAL` are optional. Positions are ICRS at the Julian year in
+    the column `epoch`, or else at `epoch_year`; proper motion moves them to J2000.0. Proper motion
+    in right ascension is times cos(declination), as in Hipparcos and Gaia. Stars of equal magnitude
+    keep the order of the file. Neighbours are searched within the catalog itself. Raises BadFile
+    naming line, column and value of up to twenty faults.
     """
     columns = catalog_csv.read_csv_catalog(path)
     epoch = columns.pop("epoch_year")
     epoch = np.where(np.isnan(epoch), epoch_year, epoch)
-    # Positions of J2000.0 stay as they are, to the last bit.
+    # Positions at J2000.0 are unchanged to the last bit.
     for year in np.unique(epoch[epoch != J2000_YEAR]).tolist():
         rows = np.flatnonzero(epoch == year)
         ra, dec, pm_ra, pm_dec = (columns[name][rows] for name in POSITION_AND_MOTION)
@@ -184,19 +188,21 @@ def import_sky2000(
 
 
 def import_catalog(path: Path, form: CatalogFormat | None = None) -> Catalog:
-    """A site's own catalog in either form; without one named, the file's beginning tells."""
+    """A site's own catalog in CSV or SKY2000 format; by default recognised by the file's first
+    bytes.
+    """
     if (form or catalog_format(path)) == "sky2000":
         return import_sky2000(path)[0]
     return import_csv(path)
 
 
 def catalog_format(path: Path) -> CatalogFormat:
-    """The form of a site's file: SKY2000 where it begins as those records do, else CSV."""
+    """The format of a site's catalog file: SKY2000 if it begins like its records, else CSV."""
     return "sky2000" if sky2000.is_sky2000(path) else "csv"
 
 
 def _of_a_site(path: Path, columns: Mapping[str, npt.NDArray[Any]]) -> Catalog:
-    """The catalog of a site's columns: sorted by magnitude, neighbours found within itself."""
+    """The catalog made of a site's columns: sorted by magnitude, with neighbours within itself."""
     order = np.argsort(columns["magnitude_v_mag"], kind="stable")
     columns = {key: column[order] for key, column in columns.items()}
     direction = from_ra_dec(columns["ra_deg"], columns["dec_deg"])
@@ -206,7 +212,7 @@ def _of_a_site(path: Path, columns: Mapping[str, npt.NDArray[Any]]) -> Catalog:
 
 
 def save(catalog: Catalog, path: Path) -> None:
-    """Writes a catalog to a file for `load`, with every number as it is."""
+    """Write a catalog to a file for `load`, with unchanged numbers."""
     columns = {name: getattr(catalog, name) for name in COLUMNS}
     if catalog.label is not None:
         columns[LABEL] = catalog.label
@@ -214,7 +220,7 @@ def save(catalog: Catalog, path: Path) -> None:
 
 
 def _packed(columns: Mapping[str, npt.NDArray[Any]]) -> bytes:
-    """The bytes of a site's file, its columns in the fixed order."""
+    """The bytes of a site's catalog file, with its columns in a fixed order."""
     return pack({name: columns[name] for name in (*COLUMNS, LABEL) if name in columns})
 
 
@@ -225,10 +231,10 @@ def moved(
     pm_dec_mas_per_year: npt.ArrayLike,
     years: float,
 ) -> Vector:
-    """Unit vectors (N, 3) of stars after some Julian years, seen from the barycentre.
+    """Unit vectors (N, 3) of stars moved by some Julian years, seen from the barycentre.
 
-    A star goes along the straight line through space that its proper motion starts,
-    which also holds beside the pole; radial velocities are not known and taken as zero.
+    A star moves in space along a straight line in the direction of its proper motion, which is
+    valid near the pole too; radial velocities are assumed zero.
     """
     shift = motion_in(ra_deg, dec_deg, pm_ra_mas_per_year, pm_dec_mas_per_year, years)
     return unit(from_ra_dec(ra_deg, dec_deg) + shift)
@@ -241,7 +247,7 @@ def motion_in(
     pm_dec_mas_per_year: npt.ArrayLike,
     years: float,
 ) -> Vector:
-    """The motion (N, 3) of stars' unit vectors in some Julian years, in radians.
+    """The change (N, 3) of stars' unit vectors in some Julian years by proper motion, in radians.
 
     Motion in right ascension is times cos(declination).
     """

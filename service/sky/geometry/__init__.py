@@ -1,1 +1,1 @@
-"""Stars, pairs and triangles indexed by place and by separation."""
+"""Indexes of stars, pairs and triangles by position and by separation."""

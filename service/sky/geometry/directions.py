@@ -1,4 +1,4 @@
-"""Directions, compiled: the angle between two, and the axes across one."""
+"""Compiled functions of directions: the angle between two, and axes perpendicular to one."""
 
 import math
 
@@ -7,7 +7,7 @@ from service.compiled.jit import njit, njit_no_refcount
 
 @njit_no_refcount
 def separation_rad(a, b):  # type: ignore[no-untyped-def]
-    """Angle in radians between two unit vectors, accurate from zero to a half turn."""
+    """The angle in radians between two unit vectors, accurate from zero to a half turn."""
     dx, dy, dz = a[0] - b[0], a[1] - b[1], a[2] - b[2]
     half_chord = 0.5 * math.sqrt(dx * dx + dy * dy + dz * dz)
     if half_chord < 0.7:
@@ -18,7 +18,7 @@ def separation_rad(a, b):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def separation_of(square):  # type: ignore[no-untyped-def]
-    """The angle in radians of a squared chord; short ones by a series as exact as the arc sine."""
+    """The angle in radians for a squared chord, by a series if short, as exact as the arc sine."""
     quarter = 0.25 * square
     half = math.sqrt(quarter)
     if quarter < 0.0064:
@@ -36,9 +36,9 @@ def separation_of(square):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def axes_across(direction, u, v):  # type: ignore[no-untyped-def]
-    """Write two directions into `u` and `v` that are at right angles to one and to each other.
+    """Write two directions into `u` and `v`, perpendicular to a direction and to each other.
 
-    `numpy.cross` takes a second to compile.
+    `numpy.cross` takes a second to compile, so this computes it by hand.
     """
     least = 0
     for i in range(3):

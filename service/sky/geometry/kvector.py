@@ -1,9 +1,8 @@
-"""The k-vector: rows of a sorted column between two values, without a search.
+"""The k-vector: range look-up in a sorted column without a search.
 
-A straight line is laid through the sorted values, and for each of its points is
-kept how many values lie below it.  A range of values then needs two look-ups,
-however long the column is, where a bisection needs its logarithm (Mortari &
-Neta, "k-vector range searching techniques", 2000).
+A straight line approximates the sorted values, and for each of its points the number of values
+below is stored. A range of values then takes two look-ups, whatever the length of the column,
+instead of a bisection (Mortari & Neta, "k-vector range searching techniques", 2000).
 """
 
 import math
@@ -18,7 +17,7 @@ from service.vectors import Vector, read_only
 
 @dataclass(frozen=True)
 class KVector:
-    """A sorted column with its k-vector.
+    """A sorted column of numbers with its k-vector.
 
     `value` (N,) ascends.  The line is z(j) = slope * j + intercept for j = 1 to
     the length of `below`, and `below[j - 1]` the number of values not above
@@ -32,12 +31,12 @@ class KVector:
 
     @property
     def nbytes(self) -> int:
-        """Bytes held."""
+        """The size of the column and its k-vector in memory, in bytes."""
         return self.value.nbytes + self.below.nbytes
 
 
 def build_kvector(value: Vector) -> KVector:
-    """The k-vector of finite values in ascending order; it may be empty."""
+    """The k-vector of finite values in ascending order, which may be empty."""
     value = np.ascontiguousarray(value, dtype=np.float64)
     if len(value) == 0:
         return KVector(read_only(value), read_only(np.zeros(1, np.int32)), 1.0, 0.0)
@@ -56,15 +55,15 @@ def build_kvector(value: Vector) -> KVector:
 
 @njit(nogil=True)
 def bracket(below, slope, intercept, low, high):  # type: ignore[no-untyped-def]
-    """The first row and the row after the last that the k-vector gives for a range of values.
+    """The first row, and the one past the last, that a k-vector gives for a range of values.
 
-    They hold every value between `low` and `high`, but for roundings of the
-    line itself, and on average one more row at the two ends together.
+    They include every value between `low` and `high`, except for rounding of the line, and on
+    average one more row in total.
     """
     last = len(below)
     first_point = (low - intercept) / slope
     last_point = (high - intercept) / slope
-    # Beyond the line's ends, and where a whole number could not hold the quotient.
+    # Also beyond the line's ends, and where an integer could not hold the quotient.
     jb = 1 if not first_point > 1.0 else last if first_point >= last else math.floor(first_point)
     jt = 1 if not last_point > 1.0 else last if last_point >= last else math.ceil(last_point)
     return below[int(jb) - 1], below[int(jt) - 1]
@@ -72,10 +71,10 @@ def bracket(below, slope, intercept, low, high):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def rows_within(value, below, slope, intercept, low, high):  # type: ignore[no-untyped-def]
-    """The first row and the row after the last of low <= value <= high, exactly.
+    """The first row, and the one past the last, of exactly the values with low <= value <= high.
 
-    The ends of the bracket are trimmed, and widened where the line was rounded
-    past a value.  An empty range gives two equal rows.
+    The bracket is trimmed at its ends, and widened where rounding of the line excluded a value. An
+    empty range gives two equal rows.
     """
     first, end = bracket(below, slope, intercept, low, high)
     while first > 0 and value[first - 1] >= low:

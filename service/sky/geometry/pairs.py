@@ -1,7 +1,6 @@
-"""The pair index that the paper calls SIDS (Star Identification Data Structure).
+"""Index of star pairs by separation, called SIDS in the paper (Star Identification Data Structure).
 
-Every pair of zone stars not farther apart than HMAX, the brighter star first,
-found by separation.
+It has every pair of zone stars within HMAX of each other, the brighter star first.
 """
 
 import math
@@ -19,22 +18,22 @@ Indices = npt.NDArray[np.int32]
 
 PAIRS_PER_BIN = 4
 PARTS = 4
-"""Parts of a bin, into which pairs are counted to be sorted."""
+"""Number of sub-bins per bin into which pairs are counted for sorting."""
 MAX_IN_PART = 64
 MAX_CUBES = 64
-"""Along an edge of the cube about the sphere."""
+"""Largest number of cubes along an edge of the cube about the sphere."""
 MAX_PAIRS = 5_000_000
-"""In one index, 80 MB: more than those of the whole sky to V 8 within 8 degrees."""
+"""Largest number of pairs in one index (80 MB), more than the whole sky to V 8 within 8 degrees."""
 
 
 @dataclass(frozen=True)
 class PairIndex:
-    """Pairs in order of separation.
+    """Star pairs in order of separation.
 
-    `separation_rad` (NTOT,) ascends; `rows` (2, NTOT) are those of the brighter
-    and of the dimmer star in the zone's arrays, the brighter being the lower
-    because zones keep the brightness order of the run catalog.  `bin_start[k]`
-    is the first pair of separation bin k; the last entry is NTOT.
+    `separation_rad` (NTOT,) ascends; `rows` (2, NTOT) are the rows of the brighter and the dimmer
+    star in the zone's arrays, the brighter being the lower because zones keep the brightness order
+    of the run catalog. `bin_start[k]` is the first pair of separation bin k; the last entry is
+    NTOT.
     """
 
     separation_rad: Vector
@@ -44,34 +43,34 @@ class PairIndex:
 
     @property
     def brighter(self) -> Indices:
-        """The rows of the brighter stars (NTOT,)."""
+        """The rows (NTOT,) of the pairs' brighter stars."""
         return np.asarray(self.rows[0])
 
     @property
     def dimmer(self) -> Indices:
-        """The rows of the dimmer stars (NTOT,)."""
+        """The rows (NTOT,) of the pairs' dimmer stars."""
         return np.asarray(self.rows[1])
 
     @property
     def count(self) -> int:
-        """The number of pairs, the paper's NTOT."""
+        """The number of pairs, NTOT in the paper."""
         return len(self.separation_rad)
 
     @property
     def nbytes(self) -> int:
-        """Bytes held."""
+        """The size of the pair index in memory, in bytes."""
         arrays = (self.separation_rad, self.rows, self.bin_start)
         return sum(array.nbytes for array in arrays)
 
 
 def build_pairs(direction: Vector, separation_max_deg: float) -> PairIndex:
-    """Index the pairs of unit vectors (n, 3), rows in order of brightness, up to HMAX.
+    """Index the pairs of unit vectors (n, 3), sorted by brightness, with separations up to a limit.
 
-    Raises `BadInput` where there would be too many to keep.
+    The limit is the paper's HMAX. Raises `BadInput` for too many pairs.
     """
     limit = math.radians(separation_max_deg)
     n, direction = len(direction), locked(direction)
-    # A guess from how many there would be were the stars spread evenly over a tenth of the sky.
+    # An estimate of the number for stars spread evenly over a tenth of the sky.
     share = min(1.0, 10.0 * math.sin(0.5 * min(limit, math.pi)) ** 2)
     capacity = min(MAX_PAIRS, int(0.5 * n * n * share) + 1024) + n
     found = (np.empty(capacity), np.empty(capacity, np.int32), np.empty(capacity, np.int32))
@@ -100,12 +99,11 @@ def build_pairs(direction: Vector, separation_max_deg: float) -> PairIndex:
 
 @njit(nogil=True)
 def _find_pairs(direction, limit, separation, brighter, dimmer):  # type: ignore[no-untyped-def]
-    """The number of pairs up to a separation, and whether there was room to write all of them.
+    """Find the pairs up to a separation; returns their number, and true if all fit in the arrays.
 
-    Stars are put into cubes as wide as the longest chord, so that partners are
-    in the same cube or in one that touches it.  A third of those are partners,
-    which nothing foretells: everyone is written where the next one goes, and
-    counted if it is one, for that is cheaper than to branch.
+    Stars are sorted into cubes as wide as the longest chord, so that partners are in the same or in
+    adjacent cubes. About a third of the candidates are partners, unpredictably: each is written to
+    the next slot and counted only if it is one, which is cheaper than a branch.
     """
     n, capacity = len(direction), len(separation)
     chord = 2.0 * math.sin(0.5 * min(limit, math.pi))
@@ -130,7 +128,7 @@ def _find_pairs(direction, limit, separation, brighter, dimmer):  # type: ignore
         for i in range(3):
             ordered[at, i] = direction[row, i]
         place[cube[row]] += 1
-    # A little more than the chord: the separation decides.
+    # A little more than the chord; the separation decides.
     most = chord * chord * (1.0 + 1e-12)
     count = 0
     complete = True
@@ -140,7 +138,7 @@ def _find_pairs(direction, limit, separation, brighter, dimmer):  # type: ignore
         x, y, z = own // (side * side), own // side % side, own % side
         a0, a1, a2 = ordered[at, 0], ordered[at, 1], ordered[at, 2]
         low, high = max(z - 1, 0), min(z + 1, side - 1)
-        # Cubes along z lie one after another; each pair of touching cubes is met once.
+        # Cubes along z are contiguous; each pair of touching cubes is visited once.
         for part in range(5):
             if part == 0:
                 first, last = at + 1, start[own - z + high + 1]
@@ -178,11 +176,10 @@ def _find_pairs(direction, limit, separation, brighter, dimmer):  # type: ignore
 
 @njit(nogil=True)
 def _sort_pairs(found, one, other, bins_per_rad, separation, brighter, dimmer, bin_start):  # type: ignore[no-untyped-def]
-    """Put pairs in order of separation, then of their stars, and tell where each bin starts.
+    """Sort pairs by separation and then by stars, and fill in the start of each bin.
 
-    They are counted into parts of bins, so few to a part that hardly any is out
-    of order.  Stars as evenly spaced as no sky has them crowd the parts: the pairs are
-    then in order of parts alone, and False is returned.
+    Pairs are counted into sub-bins that hold few each. Unnaturally regular stars may overfill
+    sub-bins: then pairs are sorted by sub-bin only, and False is returned.
     """
     count, bins = len(separation), len(bin_start) - 1
     parts, parts_per_rad = bins * PARTS, bins_per_rad * PARTS

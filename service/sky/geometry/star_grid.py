@@ -1,8 +1,7 @@
-"""Zone stars by place: which stars lie within a small angle of a direction.
+"""A spatial grid of zone stars, for finding the stars within a small angle of a direction.
 
-The sphere is projected on the six faces of a cube and each face cut into square
-cells; a face's cells cover only what its stars span.  A star near an edge
-stands on both faces, so that a look-up never leaves its own.
+The sphere is projected on the six faces of a cube, and each face is divided into square cells that
+cover only its stars. A star near an edge is on both faces, so that a look-up needs only one face.
 """
 
 from dataclasses import dataclass
@@ -14,21 +13,21 @@ from service.compiled.jit import njit
 from service.vectors import Vector, read_only
 
 CELL = 0.03
-"""Width of a cell, about 1.7 deg at the middle of a face: a star of a bright catalog in each.
+"""Width of a grid cell, about 1.7 deg at the middle of a face: one star of a bright catalog each.
 
-Narrower ones hold fewer stars to look at, but a look-up waits longer for its cell than for those.
+Narrower cells hold fewer stars, but the look-up of a cell takes longer than its stars.
 """
 EDGE = 0.03
-"""How far, in face coordinates, a star may stand over the edge of a face and still be on it."""
+"""Distance in face coordinates beyond the edge of a face to which its stars extend."""
 
 
 @dataclass(frozen=True)
 class StarGrid:
-    """Rows of zone stars, cell by cell.
+    """Rows of zone stars, sorted by grid cell.
 
-    `box` (6, 4) holds each face's first cell along u and v and the number of
-    cells along either; `offset` (6,) the place of its cells in `start`, which
-    tells where in `rows` the stars of a cell begin.
+    `box` (6, 4) holds each face's first cell along u and v and the number of cells along either;
+    `offset` (6,) is the index of its cells in `start`, which has the index of each cell's first
+    star in `rows`.
     """
 
     box: npt.NDArray[np.int32]
@@ -38,12 +37,12 @@ class StarGrid:
 
     @property
     def nbytes(self) -> int:
-        """Bytes held."""
+        """The size of the star grid in memory, in bytes."""
         return self.box.nbytes + self.offset.nbytes + self.start.nbytes + self.rows.nbytes
 
 
 def build_star_grid(direction: Vector) -> StarGrid:
-    """Sort unit vectors (n, 3) into cells."""
+    """The star grid of unit vectors (n, 3)."""
     row_of, cell_u, cell_v = [], [], []
     for face in range(6):
         axis, sign = divmod(face, 2)
@@ -78,10 +77,10 @@ def build_star_grid(direction: Vector) -> StarGrid:
 
 @njit(nogil=True)
 def cells_about(p, gate, box, out):  # type: ignore[no-untyped-def]
-    """The face of a direction and the block of cells within `gate` radians of it.
+    """The cube face of a direction, and the block of grid cells within `gate` radians.
 
-    Into `out`: face, first and last cell along u, first and last along v; the
-    block is empty where last is before first.
+    Into `out`: face, first and last cell along u, first and last along v; in an empty block last is
+    before first.
     """
     axis = 0
     if abs(p[1]) > abs(p[axis]):

@@ -1,15 +1,14 @@
-"""Zone stars hashed by place: which stand near a direction, and whether one may at all.
+"""Spatial hashes of zone stars: the stars near a direction, and a test whether there are any.
 
-**Buckets.** The sphere is projected on the six faces of a cube and each face cut into square
-cells, which are hashed into four times as many buckets as there are stars: a
-look-up mostly finds an empty bucket, whatever the shape of the zone.  A star
-near an edge stands on both faces, so that a look-up never leaves its own.
+**Buckets.** The sphere is projected on the six faces of a cube and each face is divided into square
+cells, which are hashed into four times as many buckets as there are stars: most look-ups find an
+empty bucket, whatever the shape of the zone. A star near an edge is on both faces, so that a
+look-up needs only one face.
 
-**Voxels.** Space is cut into cubes, which are hashed into bits, many more than there are
-stars.  A cube's bit is set where a star lies within reach of any of its points:
-a bit that is not set rules a star out, one that is set only makes it possible.
-There is no division and no branch on the way to it, and one look at memory.  There are several
-levels, with wider cubes for a wider reach.
+**Voxels.** Space is divided into cubes, which are hashed into bits, many more than stars. A cube's
+bit is set if a star is within reach of any of its points: a cleared bit excludes a star, a set bit
+does not prove one. A test needs no division, no branch and one memory access. Several levels have
+wider cubes for a wider reach.
 """
 
 import math
@@ -22,29 +21,29 @@ from service.compiled.jit import njit, njit_inlined, njit_no_refcount
 from service.vectors import Vector, read_only
 
 CELL = 0.004
-"""Width of a cell, about 0.23 deg at the middle of a face."""
+"""Width of a bucket's cell, about 0.23 deg at the middle of a face."""
 _PER_CELL = 1.0 / CELL
 EDGE = 0.03
-"""How far, in face coordinates, a star may stand over the edge of a face and still be on it."""
+"""Distance in face coordinates beyond the edge of a face to which its stars extend."""
 BUCKETS_PER_STAR = 4
 _FACE, _U, _V = 83492791, 73856093, 19349663
-"""Odd multipliers that scatter neighbouring cells."""
+"""Odd multipliers that hash neighbouring cells to different buckets."""
 REACH_RAD = 4.5e-4 * 2.0 ** (0.5 * np.arange(7))
-"""How near a star is that the bits of a level tell of: 93 to 743 arcsec, as a chord."""
+"""Reach of the stars at each voxel level: 93 to 743 arcsec, as a chord in radians."""
 _SCALE = 0.5 / REACH_RAD
-"""Cubes to a radian: a star's ball meets about six of them."""
+"""Voxels per radian at each level: the ball about a star meets about six of them."""
 _BITS_PER_STAR = 128
 _X, _Y, _Z = 73856093, 19349663, 83492791
-"""Odd multipliers that scatter neighbouring cubes."""
+"""Odd multipliers that hash neighbouring voxels to different bits."""
 Bits = npt.NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
 class StarBuckets:
-    """Rows of zone stars and their directions (k, 3), bucket by bucket.
+    """Rows of zone stars and their directions (k, 3), sorted by hash bucket.
 
-    `start` tells where those of a bucket begin; its length less one, the number
-    of buckets, is a power of two.
+    `start` has the first entry of each bucket and the end of the last; the number of buckets is a
+    power of two.
     """
 
     start: npt.NDArray[np.int32]
@@ -53,12 +52,12 @@ class StarBuckets:
 
     @property
     def nbytes(self) -> int:
-        """Bytes held."""
+        """The size of the buckets in memory, in bytes."""
         return self.start.nbytes + self.rows.nbytes + self.direction.nbytes
 
 
 def build_star_buckets(direction: Vector) -> StarBuckets:
-    """Sort unit vectors (n, 3) into buckets."""
+    """The hash buckets of unit vectors (n, 3)."""
     row_of, bucket_of = [], []
     buckets = 1 << max(4, math.ceil(math.log2(max(1, BUCKETS_PER_STAR * len(direction)))))
     for face in range(6):
@@ -87,9 +86,9 @@ def build_star_buckets(direction: Vector) -> StarBuckets:
 
 @njit_inlined
 def cells_about(x, y, z, gate):  # type: ignore[no-untyped-def]
-    """The face of a direction and the block of cells within `gate` radians of it.
+    """The cube face of a direction, and the block of cells within `gate` radians.
 
-    Returns the face, the first and last cell along u, the first and last along v.
+    Returns the face, the first and last cell along u, and the first and last along v.
     """
     ax, ay, az = abs(x), abs(y), abs(z)
     if ax >= ay and ax >= az:
@@ -113,10 +112,10 @@ def cells_about(x, y, z, gate):  # type: ignore[no-untyped-def]
 
 @njit_inlined
 def nearest(px, py, pz, gate, start, rows, direction, used, taken):  # type: ignore[no-untyped-def]
-    """The two stars nearest to a direction within `gate` radians, -1 where there is none.
+    """The two stars nearest to a direction within `gate` radians, -1 for none.
 
-    `start`, `rows` and `direction` are the grid's.  The first `taken` of the
-    rows `used` are left out.
+    `start`, `rows` and `direction` are those of `StarBuckets`. The first `taken` of the rows `used`
+    are excluded.
     """
     face, first_u, last_u, first_v, last_v = cells_about(px, py, pz, gate)
     buckets = len(start) - 1
@@ -131,7 +130,7 @@ def nearest(px, py, pz, gate, start, rows, direction, used, taken):  # type: ign
                 z = direction[at, 2] - pz
                 chord2 = x * x + y * y + z * z
                 row = rows[at]
-                # Cells of one bucket would bring a star twice.
+                # Several cells in one bucket would give a star twice.
                 if chord2 >= second or row == one:
                     continue
                 free = True
@@ -149,7 +148,7 @@ def nearest(px, py, pz, gate, start, rows, direction, used, taken):  # type: ign
 
 
 def build_star_voxels(direction: Vector) -> Bits:
-    """The bits (levels, bytes) of unit vectors (n, 3), in each level a power of two of them."""
+    """The voxel bits (levels, bytes) of unit vectors (n, 3); a power of two per level."""
     size = 1 << max(7, (len(direction) * _BITS_PER_STAR // 8 - 1).bit_length())
     bits = np.zeros((len(REACH_RAD), size), np.uint8)
     for level in range(len(REACH_RAD)):
@@ -159,7 +158,7 @@ def build_star_voxels(direction: Vector) -> Bits:
 
 @njit_no_refcount
 def level_for(gate):  # type: ignore[no-untyped-def]
-    """The finest level that reaches as far as a gate in radians, -1 where none does."""
+    """The finest voxel level whose reach covers a gate in radians; -1 if none does."""
     for level in range(len(REACH_RAD)):
         if gate <= REACH_RAD[level]:
             return level
@@ -168,9 +167,9 @@ def level_for(gate):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, inline="always")
 def star_within_reach(bits, level, x, y, z):  # type: ignore[no-untyped-def]
-    """1 where a star may lie within a level's reach of a point not farther off than 2, else 0."""
+    """1 if a star may be within a level's reach of a point (at most 2 from the origin), else 0."""
     scale = _SCALE[level]
-    # Counted from -2, so that cutting off the fraction rounds down.
+    # Offset by -2, so that truncation rounds down.
     hashed = (
         int((x + 2.0) * scale) * _X ^ int((y + 2.0) * scale) * _Y ^ int((z + 2.0) * scale) * _Z
     ) & (8 * bits.shape[1] - 1)
@@ -195,7 +194,7 @@ def _fill(direction, reach, scale, bits):  # type: ignore[no-untyped-def]
                         + _outside(star[1], y, edge) ** 2
                         + _outside(star[2], z, edge) ** 2
                     )
-                    # A little more, against rounding on either side.
+                    # With a small margin against rounding.
                     if square <= reach * reach * 1.0001:
                         hashed = (x * _X ^ y * _Y ^ z * _Z) & mask
                         bits[hashed >> 3] |= np.uint8(1 << (hashed & 7))
@@ -203,6 +202,6 @@ def _fill(direction, reach, scale, bits):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def _outside(coordinate, cell, edge):  # type: ignore[no-untyped-def]
-    """How far a coordinate lies outside a cell, zero within it."""
+    """The distance of a coordinate outside of a cell; zero inside."""
     low = cell * edge - 2.0
     return max(low - coordinate, coordinate - low - edge, 0.0)

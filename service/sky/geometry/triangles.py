@@ -1,17 +1,16 @@
-"""The guide triangles of PTP: planar triangles of neighbouring stars, found by one number.
+"""The guide triangles of PTP: planar triangles of neighbouring stars, looked up by one number.
 
-Every star is a master once; with two of its nearest neighbours, the slaves, it
-makes triangles whose three sides do not depend on the attitude.  A principal
-component analysis of all the sides gives the axis along which they differ
-most; a triangle's projection on it is the number by which it is looked up.
+Every star is a master once; with two of its nearest neighbours, the slaves, it makes triangles
+whose sides do not depend on the attitude. A principal component analysis of all sides gives the
+axis of largest variance; a triangle is looked up by its projection on that axis.
 
 F. Zhou & T. Ye, "Lost-in-Space Star Identification Using Planar Triangle
 Principal Component Analysis Algorithm", Mathematical Problems in Engineering
 2015, 982420: sections 2.1 and 2.2, equations 1 to 3.
 
-The paper lists five triangles of four slaves without naming them.  They are
-those with the nearest or the second nearest slave: of the six ways to leave
-one triangle out, only this brings the axis that its Table 1 was made with.
+The paper uses five triangles of four slaves without naming them. Here they are those with the
+nearest or the second nearest slave: of the six choices, only this one reproduces the axis behind
+the paper's Table 1.
 """
 
 import math
@@ -25,12 +24,12 @@ from service.sky.geometry.kvector import KVector, build_kvector
 from service.vectors import Matrix, Vector, locked, read_only
 
 SIDE_SCALE = 1e4
-"""Sides are chords of the unit sphere times this, as in the paper: 5 deg is 872.4."""
+"""Scale of triangle sides, which are chords of the unit sphere, as in the paper: 5 deg is 872.4."""
 SLAVES = 4
 LEAST_SEPARATION_DEG = 0.05
-"""Slaves nearer than this to their master might be its double star, and are passed over."""
+"""Least distance of a slave from its master in degrees, to exclude double stars."""
 REACH_DEG = 5.0
-"""Half the side of the paper's field of view: how far a slave may be from its master."""
+"""Largest distance of a slave from its master in degrees: half the paper's field of view."""
 
 
 Slaves = npt.NDArray[np.int32]
@@ -38,12 +37,12 @@ Slaves = npt.NDArray[np.int32]
 
 @dataclass(frozen=True)
 class TriangleIndex:
-    """Guide triangles in order of their projection.
+    """Guide triangles sorted by their projection on the principal axis.
 
-    `star` (N, 3) holds rows of the star list: master, the nearer slave, the
-    farther one.  `side` (N, 3) are |master - nearer|, |master - farther| and
-    |nearer - farther|, times SIDE_SCALE.  The same three stars may stand there
-    up to three times, once for each of them as master, and the columns differ.
+    `star` (N, 3) holds rows of the star list: master, the nearer slave, the farther one. `side` (N,
+    3) are |master - nearer|, |master - farther| and |nearer - farther|, times SIDE_SCALE. The same
+    three stars may occur up to three times, once for each of them as master, with different
+    columns.
     """
 
     star: npt.NDArray[np.int32]
@@ -52,27 +51,27 @@ class TriangleIndex:
     axis: Vector  # w
     mean: Vector  # mu
     explained: Vector
-    """Shares of the variance along the three principal axes, the greatest first."""
+    """Shares of the sides' variance along the three principal axes, largest first."""
     reach_deg: float
     slaves: int
 
     @property
     def count(self) -> int:
-        """The number of triangles."""
+        """The number of guide triangles."""
         return len(self.star)
 
     @property
     def nbytes(self) -> int:
-        """Bytes held: 36 a triangle."""
+        """The size of the triangle index in memory in bytes, 36 per triangle."""
         return self.star.nbytes + self.side.nbytes + self.projection.nbytes
 
 
 def build_triangles(
     direction: Vector, reach_deg: float = REACH_DEG, slaves: int = SLAVES
 ) -> TriangleIndex:
-    """The guide triangles of stars given as unit vectors (n, 3).
+    """The guide triangles of stars, given as unit vectors (n, 3).
 
-    Stars so few or so far apart that they make no triangle give an empty index.
+    Too few or too sparse stars give an empty index.
     """
     direction = np.ascontiguousarray(direction)
     near = np.empty((len(direction), slaves), np.int32)
@@ -81,7 +80,7 @@ def build_triangles(
 
 
 def index_triangles(direction: Vector, near: Slaves, reach_deg: float) -> TriangleIndex:
-    """The same with the slaves chosen: rows (n, slaves), -1 for none."""
+    """The index of guide triangles for chosen slaves: rows (n, slaves), -1 for none."""
     slaves = near.shape[1]
     star = np.empty((len(direction) * len(pairs_of_slaves(slaves)), 3), np.int32)
     side = np.empty((len(star), 3))
@@ -103,18 +102,18 @@ def index_triangles(direction: Vector, near: Slaves, reach_deg: float) -> Triang
 
 
 def chords(reach_deg: float) -> tuple[float, float]:
-    """The least and the greatest chord from a master to a slave, unscaled."""
+    """The least and largest chord from a master to a slave on the unit sphere."""
     least, most = np.radians([LEAST_SEPARATION_DEG, min(reach_deg, 180.0)]).tolist()
     return 2.0 * math.sin(0.5 * least), 2.0 * math.sin(0.5 * most)
 
 
 def pairs_of_slaves(slaves: int) -> list[tuple[int, int]]:
-    """Which two slaves, counted from the nearest, make a triangle with their master."""
+    """The pairs of slaves, counted from the nearest, that make a triangle with their master."""
     return [(i, j) for i in range(min(2, slaves)) for j in range(i + 1, slaves)]
 
 
 def principal_axis(side: Matrix) -> tuple[Vector, Vector, Vector]:
-    """The mean of the sides (N, 3), their principal axis, and the shares of variance.
+    """The mean of triangle sides (N, 3), their principal axis, and the shares of variance.
 
     The axis is a unit vector whose components have a positive sum.
     """
@@ -129,15 +128,14 @@ def principal_axis(side: Matrix) -> tuple[Vector, Vector, Vector]:
 
 
 def project(side: Matrix, axis: Vector, mean: Vector) -> Vector:
-    """P = w . (x - mu) of sides (N, 3); equation 3."""
+    """Projections P = w . (x - mu) of triangle sides (N, 3) on the principal axis; equation 3."""
     return np.asarray((side - mean) @ axis)
 
 
 def nearest_slaves(direction: Vector, least: float, most: float, near: Slaves) -> None:
-    """Into `near` (n, slaves) the rows nearest to each star, the nearest first, -1 for none.
+    """Fill `near` (n, slaves) with the rows of each star's nearest neighbours, -1 for none.
 
-    `least` and `most` bound the chord.  Of equally near ones the lower row
-    comes first.
+    `least` and `most` bound the chord. Of equally near stars the lower row comes first.
     """
     order = np.argsort(direction[:, 2], kind="stable")
     _choose_slaves(locked(direction), order, least, most, near)
@@ -181,9 +179,9 @@ def _choose_slaves(direction, order, least, most, near):  # type: ignore[no-unty
 
 
 def make_triangles(direction: Vector, near: Slaves, star: Slaves, side: Matrix) -> int:
-    """Every master's triangles into `star` and `side`, both (N, 3); how many there are.
+    """Fill `star` and `side`, both (N, 3), with every master's triangles; returns their number.
 
-    One with the nearest or the second nearest slave each: five of four slaves.
+    Each contains the nearest or the second nearest slave: five triangles for four slaves.
     """
     return int(_fill_triangles(locked(direction), near, star, side))
 
@@ -207,6 +205,6 @@ def _fill_triangles(direction, near, star, side):  # type: ignore[no-untyped-def
 
 @njit(nogil=True)
 def chord(a, b):  # type: ignore[no-untyped-def]
-    """The distance of two unit vectors, times SIDE_SCALE; equations 1 and 2."""
+    """The chord between two unit vectors times SIDE_SCALE; equations 1 and 2."""
     x, y, z = a[0] - b[0], a[1] - b[1], a[2] - b[2]
     return SIDE_SCALE * math.sqrt(x * x + y * y + z * z)

@@ -1,1 +1,1 @@
-"""Indexes of the whole sky, for searches without a priori attitude."""
+"""Indexes of the whole sky, for searches without an a priori attitude."""

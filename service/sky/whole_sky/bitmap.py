@@ -1,9 +1,8 @@
-"""The sky as bits: whether a star stands near a direction, for the price of one look at memory.
+"""A bitmap of the sky: a test for stars near a direction with one memory access.
 
-The sphere is unfolded to a square by way of an octahedron, which takes one
-division and no branch, and the square cut into cells.  A cell's bit is set where
-a star lies within a radius of any of its points: a bit that is not set rules a
-star out, one that is set only makes it possible.
+The sphere is unfolded to a square by way of an octahedron, which takes one division and no branch,
+and the square is divided into cells. A cell's bit is set if a star lies within a radius of any of
+its points: a cleared bit excludes a star, a set bit does not prove one.
 """
 
 import math
@@ -16,21 +15,23 @@ from service.sky.geometry.directions import axes_across
 from service.vectors import Vector, locked
 
 CELLS = 1632
-"""Along an edge of the square: cells of 3.7 to 11 arcmin, 333 kB; a cache holds several."""
+"""Cells along an edge of the square, of 3.7 to 11 arcmin: 333 kB, several fit into a processor
+cache.
+"""
 SAMPLE_RAD = 6e-4
-"""Discs are filled by points so far apart, less than the narrowest cell is wide."""
+"""Spacing of the points that fill a disc, less than the narrowest cell."""
 RIM_RAD, RIM_SAMPLE_RAD = 1.5e-4, 1e-4
-"""A rim is drawn so far outside of a disc, by points so far apart.
+"""Distance of a rim outside of a disc, and the spacing of its points.
 
-A cell whose corner only just reaches into the disc has more of the rim than that, for no corner
-is sharper than 45 deg; what is left, 6 arcsec, is for directions in single precision.
+A cell whose corner barely reaches into the disc contains more of the rim than that, since no corner
+is sharper than 45 deg; the margin of 6 arcsec is for directions in single precision.
 """
 
 Bits = npt.NDArray[np.uint8]
 
 
 def build_sky_bitmap(direction: Vector, radius_rad: float) -> Bits:
-    """The bits of unit vectors (n, 3), eight to a byte."""
+    """The bitmap of unit vectors (n, 3) with a radius, eight bits to a byte."""
     bits = np.zeros(CELLS * CELLS // 8, np.uint8)
     _fill(locked(direction), _disc(radius_rad), bits)
     return bits
@@ -38,7 +39,7 @@ def build_sky_bitmap(direction: Vector, radius_rad: float) -> Bits:
 
 @njit(nogil=True, inline="always")
 def cell_of(x, y, z):  # type: ignore[no-untyped-def]
-    """The cell of a direction of any length."""
+    """The bitmap cell of a direction of any length."""
     scale = 1.0 / (abs(x) + abs(y) + abs(z))
     u, v = x * scale, y * scale
     # The lower half is folded outwards over the edges of the upper.
@@ -53,7 +54,7 @@ def cell_of(x, y, z):  # type: ignore[no-untyped-def]
 
 @njit(inline="always")
 def _single_cell(x, y, z):  # type: ignore[no-untyped-def]
-    """As `cell_of`, in single precision and with nothing that keeps it from many at a time."""
+    """The bitmap cell of a direction, as `cell_of`, in single precision and vectorisable."""
     one, half, last = np.float32(1.0), np.float32(0.5 * CELLS), np.int32(CELLS - 1)
     scale = one / (abs(x) + abs(y) + abs(z))
     u, v = x * scale, y * scale
@@ -69,11 +70,11 @@ def _single_cell(x, y, z):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, error_model="numpy")
 def cells_of_pairs(count, alpha, beta, gamma, pair, cell):  # type: ignore[no-untyped-def]
-    """The cells (2, count) of one point's places in many pairs of stars, taken both ways round.
+    """The cells (2, count) of one point's predicted places for many star pairs, in both orders.
 
-    `pair` (6, m) holds the two directions of every pair, component by component;
-    the coefficients are those of the two and of their cross product.  All are in
-    single precision, which is far within what the bitmaps allow for.
+    `pair` (6, m) holds the two directions of every pair, component by component; the coefficients
+    belong to the two directions and their cross product. All are in single precision, which the
+    bitmaps allow for.
     """
     for q in range(count):
         x0, x1, x2 = pair[0, q], pair[1, q], pair[2, q]
@@ -91,7 +92,9 @@ def cells_of_pairs(count, alpha, beta, gamma, pair, cell):  # type: ignore[no-un
 
 @njit(nogil=True, error_model="numpy")
 def cells_of_points(count, coefficients, x, y, cell):  # type: ignore[no-untyped-def]
-    """The cells (count) of many points' places, coefficients (3, count), in one pair of stars."""
+    """The cells (count) of many points' predicted places, coefficients (3, count), for one star
+    pair.
+    """
     x0, x1, x2, y0, y1, y2 = x[0], x[1], x[2], y[0], y[1], y[2]
     z0, z1, z2 = x1 * y2 - x2 * y1, x2 * y0 - x0 * y2, x0 * y1 - x1 * y0
     alpha, beta, gamma = coefficients[0], coefficients[1], coefficients[2]
@@ -104,7 +107,7 @@ def cells_of_points(count, coefficients, x, y, cell):  # type: ignore[no-untyped
 
 
 def _disc(radius_rad: float) -> Vector:
-    """Points (k, 2) of a disc and its rim, so close that no cell which it touches has none."""
+    """Points (k, 2) of a disc and its rim, dense enough to hit every cell that the disc touches."""
     steps = np.arange(-int(radius_rad / SAMPLE_RAD), int(radius_rad / SAMPLE_RAD) + 1) * SAMPLE_RAD
     inner = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
     rim_rad = radius_rad + RIM_RAD

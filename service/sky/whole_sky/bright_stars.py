@@ -1,4 +1,4 @@
-"""The stars that a picture of anybody's lens may show: all that are bright, moved to a year."""
+"""The bright stars that a picture from any lens may show, moved to a year's epoch."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,12 +12,14 @@ from service.vectors import Vector, read_only
 
 FAINTEST_MAG = 9.0
 MERGED_ARCSEC = 40.0
-"""Two stars nearer than this are one on most pictures: the brighter one."""
+"""Distance in arcsec within which two stars are merged on most pictures, into the brighter one."""
 
 
 @dataclass(frozen=True, eq=False)
 class BrightStars:
-    """Directions (n, 3), ICRS, brightest first, with V and the row of the catalog."""
+    """Directions (n, 3) of bright stars, ICRS, brightest first, with V magnitude and catalog
+    row.
+    """
 
     catalog: Catalog
     year: float
@@ -27,17 +29,17 @@ class BrightStars:
 
     @property
     def nbytes(self) -> int:
-        """Bytes held."""
+        """The size of the list of stars in memory, in bytes."""
         return int(self.direction.nbytes + self.magnitude_mag.nbytes + self.row.nbytes)
 
     @cached_property
     def star_id(self) -> tuple[str, ...]:
-        """The identifier of every star."""
+        """The identifiers of all bright stars."""
         return tuple(self.catalog.star_ids(self.row))
 
 
 def bright_stars(catalog: Catalog, year: float) -> BrightStars:
-    """Those of a catalog in a Julian year, without the fainter ones of close pairs."""
+    """The bright stars of a catalog in a Julian year, without the fainter stars of close pairs."""
     row = np.flatnonzero(catalog.magnitude_v_mag <= FAINTEST_MAG)
     direction = moved(
         catalog.ra_deg[row],
@@ -49,7 +51,7 @@ def bright_stars(catalog: Catalog, year: float) -> BrightStars:
     reach = np.radians(MERGED_ARCSEC / 3600.0)
     close = cKDTree(direction).query_pairs(reach, output_type="ndarray")
     kept = np.ones(len(row), dtype=bool)
-    # Rows are in order of brightness: of a pair the later one is the fainter.
+    # Rows are in order of brightness: the later star of a pair is the fainter one.
     kept[close.max(axis=1)] = False
     return BrightStars(
         catalog,

@@ -1,4 +1,4 @@
-"""What an identifier without a prior looks at: the whole sky's stars by place, and triangles."""
+"""The guide database for identification without a prior: all stars by position, and triangles."""
 
 import math
 from dataclasses import dataclass
@@ -12,15 +12,15 @@ from service.sky.geometry.triangles import SLAVES, TriangleIndex, build_triangle
 from service.vectors import Vector, read_only
 
 CROWD_RAD = math.radians(1.0)
-"""How near a star's neighbours are when they tell how crowded its place is."""
+"""Radius in radians of the neighbourhood that measures a star's crowding."""
 
 
 @dataclass(frozen=True)
 class Guide:
     """The guide database of PTP: `direction` (n, 3) of a run catalog's stars in its own order.
 
-    `density` (n,) are stars per steradian where each star is: the sky's mean, or
-    in a cluster more.
+    `density` (n,) is the number of stars per steradian at each star: the sky's mean, or more in a
+    cluster.
     """
 
     direction: Vector
@@ -30,13 +30,13 @@ class Guide:
 
     @property
     def nbytes(self) -> int:
-        """Bytes held beyond the run catalog."""
+        """The size of the guide database in memory beyond the run catalog, in bytes."""
         return self.density.nbytes + self.grid.nbytes + self.triangles.nbytes
 
 
 @dataclass(frozen=True)
 class GuideKey:
-    """What a guide database depends on: its key in the cache."""
+    """The inputs of a guide database: its key in the cache."""
 
     run_catalog: str
     reach_deg: float
@@ -44,7 +44,7 @@ class GuideKey:
 
 
 def build_guide(run_catalog: RunCatalog, reach_deg: float, slaves: int = SLAVES) -> Guide:
-    """The guide database of a run catalog for fields of view of that radius."""
+    """The guide database of a run catalog for fields of view of a given radius."""
     return Guide(
         run_catalog.direction,
         read_only(densities(run_catalog.direction)),
@@ -54,7 +54,7 @@ def build_guide(run_catalog: RunCatalog, reach_deg: float, slaves: int = SLAVES)
 
 
 def densities(direction: Vector) -> Vector:
-    """Stars per steradian about each star (n, 3), itself left out; the sky's mean at least."""
+    """Stars per steradian about each star (n, 3), without that star; at least the sky's mean."""
     crowd = np.zeros(len(direction), np.int64)
     order = np.argsort(direction[:, 2])
     _count_near(direction, order, 2.0 * math.sin(CROWD_RAD / 2.0), crowd)
@@ -64,7 +64,9 @@ def densities(direction: Vector) -> Vector:
 
 @njit(nogil=True)
 def _count_near(direction, order, most, count):  # type: ignore[no-untyped-def]
-    """Add to `count` (n,) how many others lie within a chord of each star; `order` is that of z."""
+    """Add to `count` (n,) the number of other stars within a chord of each star; `order` sorts by
+    z.
+    """
     for at in range(len(order)):
         one = order[at]
         for other_at in range(at + 1, len(order)):

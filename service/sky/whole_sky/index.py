@@ -1,9 +1,9 @@
-"""The whole sky made ready for a search without a prior.
+"""The whole-sky index for a search without a prior.
 
-Pairs of stars lie in classes of the fainter star's magnitude, in each by
-separation, so that an observed pair finds its candidates without looking at
-stars too faint for it; bitmaps say where no star can be; and every patch of the
-sky has a list of the stars that a field of view about it may hold.
+Star pairs are sorted into classes of the fainter star's magnitude, then by separation, so that
+candidates for an observed pair are found without examining fainter stars; bitmaps show where no
+star is; and every patch of the sky has a list of the stars that a field of view centred there may
+contain.
 """
 
 import math
@@ -24,19 +24,19 @@ from service.sky.whole_sky.bitmap import build_sky_bitmap
 from service.vectors import ARCSEC_PER_RADIAN, Vector, read_only
 
 LINE = 64
-"""Arrays begin with a line of the processor's caches."""
+"""Alignment of arrays in the block, the size of a processor's cache line."""
 HEAD_WORDS = 64
-"""The head of the block, three words an array."""
+"""Number of 64-bit words in the head of the block, three per array."""
 FIRST, LAST, ROWS = 0, 1, 2
 """The words of an array in the head: its first byte, the byte after its last, and its rows."""
 
 StoreBytes = npt.NDArray[np.uint8]
 Form = tuple[str, Sequence[int]]
-"""Type and shape of an array."""
+"""The data type and shape of an array."""
 
 
 def stored(arrays: Sequence[npt.NDArray[Any]]) -> tuple[StoreBytes, list[npt.NDArray[Any]]]:
-    """The arrays one after the other in a block, and the same arrays as views of it; locked."""
+    """Arrays copied into one read-only block, and views of the copies."""
     head = np.zeros(HEAD_WORDS, np.int64)
     at = head.nbytes
     for k, array in enumerate(arrays):
@@ -52,7 +52,7 @@ def stored(arrays: Sequence[npt.NDArray[Any]]) -> tuple[StoreBytes, list[npt.NDA
 
 
 def views_of(store: StoreBytes, forms: Sequence[Form]) -> list[npt.NDArray[Any]]:
-    """The arrays in a block, of these types and shapes, as views of it; locked."""
+    """Read-only views of the arrays in a block, with given types and shapes."""
     head = store[: 8 * HEAD_WORDS].view(np.int64)
     return [
         read_only(store[head[3 * k + FIRST] : head[3 * k + LAST]].view(dtype).reshape(shape))
@@ -61,39 +61,37 @@ def views_of(store: StoreBytes, forms: Sequence[Form]) -> list[npt.NDArray[Any]]
 
 
 BUCKET_RAD = 4.0 / ARCSEC_PER_RADIAN
-"""Separations are found to this much."""
+"""Width in radians of the buckets of pair separations."""
 MAX_PAIR_DEG = 8.0
 FURTHER_MAG = 1.0
-"""Noise shows stars beyond the limit; so far beyond it they are matched, though not looked for."""
+"""Magnitudes beyond the limit to which stars are matched, since noise may make them visible."""
 CLASSES_BELOW_LIMIT_MAG = (2.5, 2.0, 1.5, 1.25, 1.0, 0.75, 0.5, 0.25)
 BITMAP_RADII_RAD = tuple(
     arcsec / ARCSEC_PER_RADIAN
     for arcsec in (60.0, 140.0, 190.0, 240.0, 310.0, 400.0, 530.0, 700.0, 1500.0)
 )
 PATCHES = 24
-"""Along an edge of a face of the cube."""
+"""Number of patches along an edge of a face of the cube."""
 PATCH_RADIUS_RAD = math.sqrt(2.0) / PATCHES
-"""From the middle of a patch to its corners, at most: that of the largest, at a face's middle."""
+"""Largest distance from the middle of a patch to its corners, at a face's middle, in radians."""
 BRIGHTEST_MAG, STEP_MAG = -2.0, 0.05
-"""First magnitude of the table of rows by magnitude, and its steps."""
+"""First magnitude, and step, of the table of rows by magnitude."""
 MAX_STARS = 60_000
-"""Rows are kept in 16 bits."""
+"""Largest number of stars, since rows are stored in 16 bits."""
 MAX_PAIRS = 1_500_000
-"""6 MB.  Of a deeper catalog only its brightest stars are looked for."""
+"""Largest number of pairs (6 MB); of a deeper catalog only the brightest stars are used."""
 
 
 class Index(NamedTuple):
-    """The index as the kernels take it.
+    """The whole-sky index in the form that kernels take.
 
-    `stars` (n, 4) holds x, y, z and the magnitude, `place` (n, 4) the same in single
-    precision, which is enough to look for stars, and `cell_place` as `cell_rows` has them;
-    `brighter` (k) how many are brighter than every step of the magnitude;
-    `pairs` (p, 2) the brighter and the dimmer row; `class_edge` (c, 2) the faintest
-    magnitude of a class,
-    the limit for the last one, and the share of all pairs in it and those
-    before; `face` (6, 5) the grid's box and offset.  `bits` has a bitmap for every
-    radius, of the stars within the limit, then the same of all.  Pairs are of stars
-    within the limit, the grid and the patches have those further ones as well.
+    `stars` (n, 4) holds x, y, z and the magnitude, `place` (n, 4) the same in single precision for
+    filtering, and `cell_place` the same in the order of `cell_rows`; `brighter` (k) the number of
+    stars brighter than each magnitude step; `pairs` (p, 2) the brighter and the dimmer row;
+    `class_edge` (c, 2) the faintest magnitude of each class, the limit for the last one, and the
+    cumulative share of all pairs; `face` (6, 5) the grid's box and offset. `bits` has a bitmap for
+    every radius, of the stars within the limit, and then the same for all stars. Pairs are of stars
+    within the limit; the grid and the patches also have fainter stars.
     """
 
     stars: Any
@@ -113,19 +111,18 @@ class Index(NamedTuple):
 
 ARRAYS = len(Index._fields)
 AT = Index(*range(ARRAYS))
-"""The place of each array in the head of the store."""
+"""The index of each array in the head of the store."""
 
 
 @dataclass(frozen=True, eq=False)
 class SkyIndex:
-    """The stars of a run catalog, brightest first, for fields of view up to a radius.
+    """The whole-sky index of a run catalog, for fields of view up to a radius.
 
-    `offset` (classes, buckets + 1) tells where in `arrays.pairs` the pairs of a
-    class and of a bucket of separation begin; `patch_start` and `patch_rows`
-    list the stars within a field of view's reach of each patch, brightest
-    first.  Pairs are looked for among stars to `limit_mag`; the attitudes that
-    they give are held against `FURTHER_MAG` more.  Everything is in
-    `store`, one block locked against writing, of which `arrays` are views.
+    `offset` (classes, buckets + 1) has the index in `arrays.pairs` of the first pair of each class
+    and separation bucket; `patch_start` and `patch_rows` list the stars within reach of a field of
+    view in each patch, brightest first. Pairs are of stars to `limit_mag`; the resulting attitudes
+    are tested with stars `FURTHER_MAG` fainter. All arrays are views of `store`, one read-only
+    block.
     """
 
     run_catalog: str
@@ -136,12 +133,12 @@ class SkyIndex:
 
     @property
     def nbytes(self) -> int:
-        """Bytes held."""
+        """The size of the whole-sky index in memory, in bytes."""
         return self.store.nbytes
 
     @property
     def content(self) -> Content:
-        """The content of its file."""
+        """The whole-sky index as the content of a file."""
         facts = {
             "run_catalog": self.run_catalog,
             "limit_mag": self.limit_mag,
@@ -152,36 +149,37 @@ class SkyIndex:
 
     @classmethod
     def of_content(cls, content: Content) -> "SkyIndex":
-        """The index that a file holds."""
+        """A whole-sky index from the content of a file."""
         facts, store = dict(content.facts), content.arrays["store"]
         arrays = Index(*views_of(store, facts.pop("forms")))
         return cls(**facts, store=store, arrays=arrays)
 
     @property
     def stars(self) -> int:
-        """The number of stars."""
+        """The number of stars in the index."""
         return len(self.arrays.stars)
 
     @property
     def pairs(self) -> int:
-        """The number of pairs."""
+        """The number of star pairs in the index."""
         return len(self.arrays.pairs)
 
 
 def build_sky_index(run_catalog: RunCatalog, limit_mag: float, radius_deg: float) -> SkyIndex:
-    """Index the stars to a limit for fields of view whose farthest corner is at `radius_deg`.
+    """Build the index of stars to a limit, for fields of view whose farthest corner is at
+    `radius_deg`.
 
-    Stars of the run catalog beyond the limit are for matching alone.  Where
-    there are more stars than fit, the faintest are left out.
+    Fainter stars of the run catalog are used for matching only. If there are too many stars, the
+    faintest are left out.
     """
     magnitude = run_catalog.magnitude_mag
     separation_max_deg = min(MAX_PAIR_DEG, 2.0 * radius_deg)
-    # Evenly spread stars make n^2 (1 - cos(separation)) / 4 pairs, real ones somewhat more.
+    # Evenly distributed stars make n^2 (1 - cos(separation)) / 4 pairs, real ones somewhat more.
     within = 1.0 - math.cos(math.radians(separation_max_deg))
     most = min(MAX_STARS, int(math.sqrt(3.0 * MAX_PAIRS / within)))
     count = min(int(np.searchsorted(magnitude, limit_mag, "right")), most)
     known = min(int(np.searchsorted(magnitude, limit_mag + FURTHER_MAG, "right")), MAX_STARS)
-    # Without room for all stars within the limit those beyond it would leave a gap.
+    # If not all stars within the limit fit, fainter ones would leave a gap.
     if count < np.searchsorted(magnitude, limit_mag, "right"):
         known = count
     direction = np.ascontiguousarray(run_catalog.direction[:known])
@@ -191,7 +189,7 @@ def build_sky_index(run_catalog: RunCatalog, limit_mag: float, radius_deg: float
     pair_class = np.searchsorted(edge, magnitude[pairs.dimmer])
     bucket = (pairs.separation_rad / BUCKET_RAD).astype(np.int64)
     buckets = int(math.radians(separation_max_deg) / BUCKET_RAD) + 1
-    # Bucket by bucket, not by separation within one, so that near stars lie together.
+    # Sorted by bucket, not by separation within a bucket, so that nearby stars are close in memory.
     order = np.lexsort((pairs.dimmer, bucket, pair_class))
     key = (pair_class * buckets + bucket)[order]
     start = np.searchsorted(key, np.arange(len(edge) * buckets + 1))
@@ -226,7 +224,7 @@ def build_sky_index(run_catalog: RunCatalog, limit_mag: float, radius_deg: float
 
 
 def _brighter(magnitude: Vector) -> npt.NDArray[np.int32]:
-    """How many stars are brighter than each step; none before the first, which bounds nothing."""
+    """The number of stars brighter than each magnitude step; zero for the first step."""
     steps = int((magnitude[-1] - BRIGHTEST_MAG) / STEP_MAG) + 2 if len(magnitude) else 1
     brighter = np.searchsorted(magnitude, BRIGHTEST_MAG + STEP_MAG * np.arange(max(steps, 1)))
     brighter[0] = 0
@@ -235,7 +233,7 @@ def _brighter(magnitude: Vector) -> npt.NDArray[np.int32]:
 
 @njit(nogil=True)
 def index_in(store):  # type: ignore[no-untyped-def]
-    """The index that a store holds; the caller holds the store."""
+    """The whole-sky index in a store; the caller keeps the store alive."""
     head = view_into(store, 0, (ARRAYS, 3), np.int64)
     classes, levels = head[AT.offset, ROWS], head[AT.bits, ROWS]
     buckets = (head[AT.offset, LAST] - head[AT.offset, FIRST]) // 4 // classes
@@ -270,7 +268,7 @@ def _column(store, head, at, dtype):  # type: ignore[no-untyped-def]
 def _patches(
     direction: Vector, radius_deg: float
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.uint16]]:
-    """For each patch of the sky: the stars of any field of view with its boresight there."""
+    """For each patch of the sky: the stars of any field of view with its boresight in the patch."""
     least = math.cos(min(math.radians(radius_deg) + PATCH_RADIUS_RAD, math.pi))
     middle = (np.arange(PATCHES) + 0.5) * 2.0 / PATCHES - 1.0
     start, rows = [0], []
@@ -288,7 +286,7 @@ def _patches(
 
 @njit(nogil=True, inline="always")
 def patch_of(p):  # type: ignore[no-untyped-def]
-    """The patch of a direction (3,)."""
+    """The number of the sky patch of a direction (3,)."""
     axis = 0
     if abs(p[1]) > abs(p[axis]):
         axis = 1

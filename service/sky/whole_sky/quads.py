@@ -1,8 +1,7 @@
-"""Patterns of four stars, found by their shape whatever the scale: the index of the blind solver.
+"""Patterns of four stars by shape, independent of scale: the pattern index of the blind solver.
 
-Of four directions the two farthest apart make a frame of reference, in which the
-other two have four coordinates; no rotation, and no change of scale, moves them
-(Lang et al. 2010).  The chirality stays: a mirrored pattern has another code.
+The two stars farthest apart define a frame, in which the other two have four coordinates,
+independent of rotation and scale (Lang et al. 2010). A mirrored pattern has another code.
 """
 
 from dataclasses import dataclass
@@ -17,25 +16,28 @@ from service.vectors import Vector
 Rows = npt.NDArray[np.int32]
 
 LEVELS_DEG = (2.4, 4.8, 9.6, 19.2, 1.2)
-"""Radii of the caps whose stars make patterns; those of one level are up to twice as wide.
+"""Radii in degrees of the caps whose stars make patterns; patterns are up to twice as wide.
 
-The narrowest, the dearest to build, is looked at last."""
+The narrowest level is the most expensive to build, and searched last.
+"""
 DEEPEST_RANK = 8
-"""A star of a level has fewer brighter ones than this in the cap about it."""
+"""A star is used at a level if it has fewer brighter stars than this in the cap about it."""
 COMPANIONS = 5
-"""Brightest stars of each star's cap that make patterns with it."""
+"""Number of brightest stars in each star's cap that make patterns with the star."""
 LEAST_WIDTH = 0.6
-"""Least width of a pattern, as a share of the level's radius; the level below has narrower ones."""
+"""Least width of a pattern, as a share of the level's radius; narrower ones belong to the next
+level.
+"""
 _PAIRS = np.array(list(combinations(range(4), 2)))
 _OTHERS = np.array([[k for k in range(4) if k not in pair] for pair in _PAIRS.tolist()])
 
 
 @dataclass(frozen=True, eq=False)
 class QuadLevel:
-    """The patterns of one scale.
+    """The star patterns of one angular size.
 
-    `stars` (q, 4) are rows of the catalog in the order of their code, `chord` (q,) the
-    distance of the first two as a chord of the unit sphere, `tree` holds the codes.
+    `stars` (q, 4) are catalog rows in the order of the code, `chord` (q,) the distance of the first
+    two as a chord of the unit sphere, `tree` a search tree of the codes.
     """
 
     radius_deg: float
@@ -45,17 +47,17 @@ class QuadLevel:
 
     @property
     def nbytes(self) -> int:
-        """Bytes held, those of the tree estimated."""
+        """The size of the patterns in memory in bytes, with the tree estimated."""
         return int(self.stars.nbytes + self.chord.nbytes + 56 * len(self.stars))
 
 
 def build_quad_level(direction: Vector, radius_deg: float) -> QuadLevel:
-    """The patterns among directions (n, 3), brightest first, within caps of a radius.
+    """The star patterns among directions (n, 3), brightest first, within caps of a radius.
 
-    In every part of the sky, rich or poor, about as many of its brightest stars are used.
+    Every part of the sky, rich or poor, contributes about as many of its brightest stars.
     """
     cap = 0.5 * (1.0 - np.cos(np.radians(radius_deg)))
-    # Three times the stars that evenly spread ones would need, so that poor regions have enough.
+    # Three times the number for evenly distributed stars, so that poor regions have enough.
     used = min(len(direction), int(3 * DEEPEST_RANK / cap))
     reach = 2.0 * np.sin(0.5 * np.radians(radius_deg))
     pairs = cKDTree(direction[:used]).query_pairs(reach, output_type="ndarray")
@@ -77,11 +79,11 @@ def build_quad_level(direction: Vector, radius_deg: float) -> QuadLevel:
 
 
 def quad_codes(direction: Vector) -> tuple[Vector, Rows, Vector]:
-    """The codes (q, 4) of patterns (q, 4, 3), the order of their stars, the widest chord (q,).
+    """The codes (q, 4) of patterns (q, 4, 3), the order of their stars, the largest chord (q,).
 
-    Coordinates are on the plane that touches the sky between the two stars farthest
-    apart, in units of half their distance.  The two are named so that the others lie
-    nearer to the first, the others from left to right.
+    Coordinates are on the plane that touches the sky between the two stars farthest apart, in units
+    of half their distance. The two are ordered so that the others lie nearer to the first, the
+    others from left to right.
     """
     apart = direction[:, _PAIRS[:, 0]] - direction[:, _PAIRS[:, 1]]
     chord2 = np.einsum("qki,qki->qk", apart, apart)
