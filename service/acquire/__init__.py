@@ -1,4 +1,4 @@
-"""Acquisition of batches: identification of the stars, then the attitude."""
+"""Acquisition of batches: star identification, then attitude determination."""
 
 from service.acquire.pipeline import ResultColumns, acquire, acquire_many, acquired
 from service.acquire.result import Acquisition

@@ -1,4 +1,4 @@
-"""The settings of one batch: its own options, and its mission's for the others."""
+"""The settings of one batch: its own options, completed by those of its mission."""
 
 from collections.abc import Sequence
 
@@ -32,13 +32,14 @@ TEST_OF_TOLERANCE = {
     "pole_angle_deg": "pole",
     "fov_rotation_deg": "fov_rotation",
 }
-"""The test without which a tolerance takes no part."""
+"""The test that uses each tolerance; without the test the tolerance has no effect."""
 
 
 def idle_reason(name: str, identifier: str, tests: Tests, zone: Cap | Band) -> str | None:
-    """Why a test or a tolerance changes no answer; None where it may change one.
+    """The reason why a test or tolerance cannot change an answer; None if it can.
 
-    This is THE table of which setting acts under which identifier, tests and kind of zone.
+    This is the one table of the settings that act under each identifier, set of tests and kind of
+    zone.
     """
     used = IDENTIFIERS[identifier].uses
     if used is not None and name not in used:
@@ -52,13 +53,13 @@ def idle_reason(name: str, identifier: str, tests: Tests, zone: Cap | Band) -> s
 
 
 TURNED_BY_NOISE_DEG = 3.0
-"""How far noise turns the direction of a close pair."""
+"""Angle by which noise may rotate the direction of a close pair, in degrees."""
 TURNED_IN_MARGINS = 2.0
-"""An attitude that is farther from its prediction is not used (`search.contradicts`)."""
+"""Largest deviation of an attitude from its prediction, in zone margins (`search.contradicts`)."""
 
 
 class Choices(Struct, frozen=True, eq=False, gc=False):
-    """The identifier, the solver, the rules and the zone grid of one batch."""
+    """The effective settings of one batch: identifier, solver, rules and zone grid."""
 
     identifier: Identifier
     solver: SolverName
@@ -72,16 +73,16 @@ class Choices(Struct, frozen=True, eq=False, gc=False):
 
     @property
     def tests(self) -> Tests:
-        """The tests that are made."""
+        """The switches of the identification tests."""
         return self.rules.tests
 
 
 def choices_of(batch: ObservationBatch, mission: Mission) -> Choices:
-    """The settings that hold for a batch.
+    """The effective settings of a batch: its options, else the mission's settings.
 
-    A test that cannot be made is off: the pole test in a cap, which a predicted attitude
-    has in bands too, and tests that compare with the presumed roll where an a priori
-    boresight leaves it open.  About a prediction the cross product test is stricter.
+    Impossible tests are switched off: the pole test in a cap, which a predicted attitude has in
+    bands too, and tests that need the roll if the prior is a boresight. With a prediction the cross
+    product test is stricter.
     """
     options, grid_deg = batch.options, batch.options.zone_grid_deg
     predicted = batch.a_priori if isinstance(batch.a_priori, PredictedPrior) else None
@@ -102,12 +103,12 @@ def choices_of(batch: ObservationBatch, mission: Mission) -> Choices:
 def _own_rules(
     batch: ObservationBatch, mission: Mission, predicted: PredictedPrior | None
 ) -> Rules:
-    """The rules of a batch with tests or tolerances of its own, or with a prediction."""
+    """The rules of a batch that has its own tests or tolerances, or a prediction."""
     options = batch.options
     tests = {**options.tests, **dict.fromkeys(impossible_tests(batch, mission), False)}
     tolerances = options.tolerances
     if predicted is not None:
-        # The roll is known as well as the rest: a pair can have turned by little.
+        # A predicted roll is as accurate as the rest: a pair can have rotated only a little.
         most_deg = TURNED_BY_NOISE_DEG + TURNED_IN_MARGINS * predicted.margin_deg
         own_deg = min(most_deg, mission.tolerances.cross_product_deg)
         tolerances = {"cross_product_deg": own_deg} | tolerances
@@ -118,7 +119,7 @@ def _own_rules(
 
 
 def idle_options(batch: ObservationBatch, mission: Mission) -> dict[str, str]:
-    """The tests and tolerances that a batch's options name in vain, each with the reason."""
+    """Tests and tolerances among a batch's options that have no effect, each with the reason."""
     options = batch.options
     if not (options.tests or options.tolerances):
         return {}
@@ -135,9 +136,9 @@ def idle_options(batch: ObservationBatch, mission: Mission) -> dict[str, str]:
 def refuse_idle_options(
     options: OptionsIn, batches: Sequence[ObservationBatch], mission: Mission, field: str
 ) -> None:
-    """Raise `BadBatch` for tests and tolerances that change nothing for any of some batches.
+    """Raise `BadBatch` for optional tests and tolerances that have no effect on any of the batches.
 
-    The batches have the options already; `field` is where those were given.
+    The batches include the options already; `field` is the location of the options for messages.
     """
     named = options.model_dump(include={"tests", "tolerances"}, exclude_none=True)
     asked = [f"{table}.{name}" for table, settings in named.items() for name in settings]
@@ -154,16 +155,16 @@ def refuse_idle_options(
 
 
 def impossible_tests(batch: ObservationBatch, mission: Mission) -> tuple[str, ...]:
-    """The tests that a batch's a priori knowledge, or its mission's zone, does not allow."""
+    """The tests that the kind of prior or the kind of zone makes impossible."""
     in_band = isinstance(mission.zone, Band) and not isinstance(batch.a_priori, PredictedPrior)
     pole = () if in_band else ("pole",)
     return pole + (TESTS_OF_ROLL if isinstance(batch.a_priori, BoresightPrior) else ())
 
 
 def aberration_velocity(batch: ObservationBatch) -> Vector:
-    """The velocity (3,), in units of c, whose aberration the catalog is given for a batch.
+    """The observer's velocity (3,) in units of c for the aberration of catalog directions.
 
-    Zero where nothing is to be corrected: directions then stay geometric.
+    It is zero if aberration is not to be corrected: directions then stay geometric.
     """
     if batch.aberration != "to_correct":
         return np.zeros(3)

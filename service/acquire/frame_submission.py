@@ -1,4 +1,4 @@
-"""From a frame to the batch of its stars, whether its camera is calibrated or not."""
+"""Conversion of a frame to a batch of its stars, for calibrated and uncalibrated cameras."""
 
 import json
 import math
@@ -29,7 +29,7 @@ from service.times import parse_utc
 from service.vectors import ARCSEC_PER_RADIAN, Vector
 
 ROUGH_SHARE = 0.05
-"""The share of the half diagonal by which a place may be off where no lens could be fitted."""
+"""Position error if no lens could be fitted, as a share of the half diagonal."""
 LEAST_SIGMA_PX = 0.05
 
 
@@ -41,10 +41,10 @@ def submit_frame(
     catalog: Catalog,
     max_pixels: int,
 ) -> Submission:
-    """The batch of the stars on a frame; the lens of a camera without calibration is fitted first.
+    """The batch of the stars on a frame; for an uncalibrated camera the lens is fitted first.
 
-    Raises `BadFile` for a file that is no frame of the tracker's and for a frame
-    without a star, `BadInput` for what does not fit the mission.
+    Raises `BadFile` for a file that is no frame of the tracker and for a frame without a star,
+    `BadInput` for data that do not fit the mission.
     """
     _, camera = mission.camera_tracker(known.tracker, "tracker")
     if camera.calibrated:
@@ -80,8 +80,8 @@ def _of_unknown_lens(
     chosen = _chosen(result, camera.most_stars, mission.catalog.magnitude_limit_mag)
     found = result.attitude
     if found is not None and known.a_priori is None:
-        # The search of the whole sky is done.  What is found about it still stands or falls
-        # by its own evidence.
+        # The whole sky has been searched already. The identification about this prior still depends
+        # on its own evidence.
         prior = {"a_priori": {"quaternion": _unit(found.quaternion)}}
         known = submit.FrameIn.model_validate_json(json.dumps(_sent_fields(known) | prior))
     stars = _observed(result, chosen, camera)
@@ -107,14 +107,14 @@ def _unit(quaternion: Vector) -> list[float]:
 
 
 def _without_time(frame: Frame) -> Frame:
-    """The same without its time: aberration is corrected once, where the batch is acquired."""
+    """A frame without its time, so that aberration is corrected only in the acquisition."""
     return replace(frame, time=None)
 
 
 def _chosen(result: PictureResult, most: int, limit_mag: float) -> list[int]:
-    """The points that go into the batch: those with a star in the run catalog, then the others.
+    """The points for the batch: those with a star in the run catalog first, then the others.
 
-    Those with a fainter star are left out, for the mission does not know it.
+    Points with fainter stars are left out, since the mission's catalog does not have them.
     """
     found = result.attitude.stars if result.attitude is not None else ()
     magnitude = {(star.u_px, star.v_px): star.magnitude_v_mag for star in found}
@@ -124,13 +124,13 @@ def _chosen(result: PictureResult, most: int, limit_mag: float) -> list[int]:
     stars = [k for k in known if not math.isnan(starless[k])]
     others = [k for k in known if math.isnan(starless[k])]
     if stars:
-        # Of clutter enough to be weighed, not so much that it is searched for long.
+        # Enough clutter to be weighed, but not so much that the search takes long.
         others = others[: max(len(stars) // 2, 3)]
     return (stars + others)[:most]
 
 
 def _scale_of(found: PictureAttitude, directions: Vector, sigma_rad: Vector) -> float:
-    """The factor by which star sigmas must grow for the attitude to be as unsure as its lens."""
+    """The factor on star sigmas that makes the attitude as uncertain as the fitted lens allows."""
     outer = np.einsum("ni,nj->nij", directions, directions)
     information = ((np.eye(3) - outer) / sigma_rad[:, None, None] ** 2).sum(axis=0)
     alone = np.diag(np.linalg.inv(information))

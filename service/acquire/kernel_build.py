@@ -1,8 +1,8 @@
-"""Compiling the kernels in child processes, before the first batch, and how far that is.
+"""Compilation of kernels in child processes before the first batch, with progress.
 
-Compiling takes a minute, holds the interpreter's lock and cannot be interrupted.
-Children can be killed, and the parent goes on answering probes; it then loads the
-kernels from the cache on disk.
+Compiling takes a minute, holds the interpreter's lock and cannot be interrupted. Child processes
+can be killed, and the parent answers probes meanwhile; it then loads the kernels from the cache on
+disk.
 """
 
 import gc
@@ -37,40 +37,44 @@ from service.sky.model import SkyModel
 
 RETRY_S = 10
 WHOLE_SKY_RETRY_S = 2
-"""Shorter: a demonstration sends its batches while the kernels of the whole sky are compiled."""
+"""Seconds after which a client may retry during the compilation of whole-sky kernels.
+
+It is shorter than for the other kernels, for a demonstration that sends batches meanwhile.
+"""
 COLLECT_EVERY = 100_000
-"""New objects between two collections of garbage while kernels are compiled, of which few are
-garbage: with Python's 700 an eighth of the time goes there."""
+"""Number of new objects between garbage collections during compilation. Few objects are garbage,
+and with Python's default of 700 an eighth of the time is spent on collections.
+"""
 
 _CONTEXT = multiprocessing.get_context("spawn")
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-"""The signals that stop the service; they may reach its whole process group."""
+"""The signals that stop the service, which may reach its whole process group."""
 
 
 class _Share(NamedTuple):
-    """The kernels that one child compiles, in this order; see `prewarm_kernels`."""
+    """The kernels that one child process compiles, in order; see `prewarm_kernels`."""
 
     zones: list[str]
-    """Identifiers that search zones."""
+    """Names of identifiers that search zones."""
     whole_sky: list[str]
-    """Identifiers that search the whole sky."""
+    """Names of identifiers that search the whole sky."""
     beside_batches: bool
     """True if kernels that no batch needs are compiled too: features, pictures."""
 
 
 class KernelBuild:
-    """A build of the kernels that the cache of this machine lacks."""
+    """A build of the kernels that are missing from this machine's cache."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._children: list[SpawnProcess] = []
         self._cancelled = False
         self.is_needed = not _is_complete()
-        """True until a build has succeeded: an answer must not depend on what is compiled."""
+        """True until a build has succeeded: answers must not depend on what is compiled."""
         self.zones_needed = self.is_needed
-        """True until the kernels of batches with a zone are compiled."""
+        """True until the kernels for batches with a zone are compiled."""
         self.whole_sky_needed = self.is_needed
-        """True until the kernels of searches of the whole sky are compiled, too."""
+        """True until the kernels for whole-sky searches are compiled, too."""
 
     @property
     def being_compiled(self) -> list[str]:
@@ -83,12 +87,12 @@ class KernelBuild:
         return [kind for kind, needed in kinds.items() if needed]
 
     def require_built(self) -> None:
-        """Raise `Busy` until the kernels are compiled."""
+        """Raise `Busy` until all kernels are compiled."""
         if self.is_needed:
             raise Busy("the service is compiling its kernels", RETRY_S)
 
     def require_whole_sky(self) -> None:
-        """Raise `Busy` until the kernels that search the whole sky are compiled."""
+        """Raise `Busy` until the kernels for whole-sky searches are compiled."""
         if self.whole_sky_needed:
             raise Busy(
                 "the service is compiling the kernels that search the whole sky", WHOLE_SKY_RETRY_S
@@ -100,11 +104,11 @@ class KernelBuild:
         zones_built: Callable[[], None] = lambda: None,
         whole_sky_built: Callable[[], None] = lambda: None,
     ) -> None:
-        """Compile what is not compiled, in two children; in one, without a second processor.
+        """Compile the missing kernels in two child processes, or in one on a single processor.
 
-        Both begin with what batches with a zone need, and go on with searches of the whole sky.
-        `zones_built` and `whole_sky_built` are called when these are compiled, while the
-        children compile the rest.  Raises `Busy` where a child fails, `Stopping` if cancelled.
+        Both begin with the kernels for batches with a zone, then those for whole-sky searches.
+        `zones_built` and `whole_sky_built` are called when these are ready, while the rest is
+        compiled. Raises `Busy` if a child fails, `Stopping` if cancelled.
         """
         if not self.is_needed:
             return
@@ -122,7 +126,7 @@ class KernelBuild:
                 self._children.append(child)
                 with safe_path():
                     child.start()
-                # The child alone holds this end: when it has ended there is nothing to wait for.
+                # Only the child may hold this end, so that its end closes the pipe.
                 sender.close()
                 receivers.append(receiver)
         with ExitStack() as ends:
@@ -146,7 +150,7 @@ class KernelBuild:
         self.is_needed = self.whole_sky_needed = False
 
     def cancel(self) -> None:
-        """End a build that is running, and let none begin."""
+        """Kill a running build, and prevent further ones."""
         with self._lock:
             self._cancelled = True
             for child in self._children:
@@ -154,14 +158,14 @@ class KernelBuild:
 
 
 def mark_built() -> None:
-    """Note in the cache that it holds every kernel."""
+    """Record in the cache folder that every kernel is there."""
     marker = _marker()
     marker.parent.mkdir(parents=True, exist_ok=True)
     marker.write_text(str(count_whole(marker.parent)), encoding="ascii")
 
 
 def _is_complete() -> bool:
-    """True if the cache holds every kernel, none of them damaged: a damaged one is removed."""
+    """True if the cache holds every kernel undamaged; damaged files are removed."""
     marker = _marker()
     try:
         expected = int(marker.read_text(encoding="ascii"))
@@ -191,10 +195,10 @@ def _exit_after(sentinel: int) -> None:
 
 
 def _marker() -> Path:
-    # numba compiles for one processor, and keys what it caches by that and by its version.
+    # numba compiles for one processor type, and its cache key includes that and its version.
     config: Any = numba.config
     processor = config.CPU_NAME or llvmlite.binding.get_host_cpu_name()
-    # One that is switched on later has its kernels compiled then.
+    # A feature that is enabled later has its kernels compiled then.
     features = features_on(os.environ.get(SETTING, ""))
     named = (each.name for each in features if "kernels" in each.brings)
     return Path(config.CACHE_DIR) / "-".join(["complete", numba.__version__, processor, *named])
@@ -205,10 +209,10 @@ def _processors() -> int:
 
 
 def _shares(processors: int) -> list[_Share]:
-    """The kernels that each child compiles.
+    """The kernels for each child process to compile.
 
-    Weighing hypotheses is one kernel that takes as long as most others together, and the
-    whole sky needs it, too: by then the first child has saved it.
+    The kernel that weighs hypotheses takes as long as most others together, and the whole sky needs
+    it, too: the first child has saved it by then.
     """
 
     def named(is_meant: Callable[[IdentifierEntry], bool]) -> list[str]:
@@ -223,7 +227,7 @@ def _shares(processors: int) -> list[_Share]:
 
 
 def _has_reported(child: connection.Connection) -> bool:
-    """Wait until a child has compiled its next share; False if it ends before that."""
+    """Wait until a child has compiled its next share; false if the child ends before that."""
     try:
         child.recv_bytes()
     except EOFError:
@@ -251,16 +255,15 @@ def _compile(
         compile_beside_batches()
 
 
-# How far the compiling of the kernels is, seen from the files that it leaves in the cache.
-#
-# The size of machine code grows evenly with the time that its compiling takes.
+# Progress of kernel compilation, estimated from the files in the cache: the size of machine code is
+# nearly proportional to its compile time.
 
 KERNEL_BYTES = 2_930_000
-"""The size of the machine code of all kernels, about; other processors differ by a tenth."""
+"""Approximate size of all kernels' machine code in bytes; other processors differ by a tenth."""
 MOST_SHARE = 0.99
-"""The largest share shown until it is over, since the size is not known to the last byte."""
+"""Largest share shown during compilation, since the exact total size is unknown."""
 LEAST_SHARE = 0.02
-"""The share before which the remaining time cannot be estimated."""
+"""Least share from which the remaining time is estimated."""
 STEPS = {
     "geometry": "zones and pairs",
     "sky": "zones and pairs",
@@ -274,19 +277,19 @@ STEPS = {
     "triangles": "triangles",
     "kernels": "features",
 }
-"""Purpose of the kernels by folder of the kernel cache."""
+"""Purpose of the kernels in each subfolder of the cache, for progress messages."""
 EVERY_S = 10.0
 
 
 @dataclass(frozen=True)
 class KernelProgress:
-    """How far the compiling is: the step it is in, and the share that is done (0 to 1)."""
+    """Progress of compilation: the current step, and the completed share (0 to 1)."""
 
     step: str
     share: float
 
     def line(self, passed_s: float) -> str:
-        """Step, share and time left, after so many seconds."""
+        """A progress message with step, share and remaining time, after `passed_s` seconds."""
         text = f"compiling kernels, {self.step}: {100.0 * self.share:.0f} %"
         if self.share < LEAST_SHARE:
             return text
@@ -294,7 +297,7 @@ class KernelProgress:
 
 
 def kernel_progress() -> KernelProgress:
-    """Progress of compiling into this process's kernel cache."""
+    """Progress of compilation into this process's kernel cache."""
     config: Any = numba.config
     files = []
     for path in Path(config.CACHE_DIR).glob("*/*.nbc"):
@@ -312,7 +315,7 @@ def kernel_progress() -> KernelProgress:
 
 @contextmanager
 def progress_logged(log: Logger) -> Iterator[None]:
-    """While the block compiles kernels: a line in the log every ten seconds."""
+    """A context manager that logs the progress of compilation every ten seconds."""
     ended, start = Event(), time.monotonic()
 
     def tell() -> None:

@@ -1,4 +1,4 @@
-"""A picture from anybody's lens: its attitude, its lens and its stars, with no mission at all."""
+"""Blind solution of a picture from any lens: attitude, lens and stars, without a mission."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -58,34 +58,34 @@ from service.vectors import (
 )
 
 GUESS_SHARE = 0.25
-"""How far off a focal length or field of view that is told may be."""
+"""Largest relative error of a stated focal length or field of view."""
 REFINED_POINTS = 200
 LEAST_SIDE_PX = 100
 MIDDLE_SHARES = (1.0 / 3.0, 0.5, 0.25)
-"""Parts of the sides of a wide picture that are solved alone."""
+"""Parts of a wide picture's sides whose middle is solved alone."""
 CHANGED_TRIALS = 16
 """Ways in which one picture is changed, at most: parts, mirror images, ranges of focal lengths."""
 LEAST_FAR_SHARE = 0.5
 """The least share of points with a star far from the middle, over that near the middle."""
 MOST_SIGMA_SHARE = 1.0 / 400.0
-"""The share of the longer side above which an attitude's sigma is too large for an answer.
+"""Largest sigma of an accepted attitude, as a share of the picture's longer side.
 
-Those of nine real pictures are .0005 of the side at most, of drawn ones with seven stars or more
-.001.  Residuals scale the sigmas: where stars lie anywhere within gates of pixels, by chance or
-because the lens's axis was cropped away, they are .004 and more.
+Nine real pictures have at most .0005, simulated ones with seven or more stars .001. Sigmas are
+scaled by residuals: for chance matches, or a lens whose axis was cropped away, they are .004 and
+more.
 """
 ENOUGH_FREEDOM = 10
-"""Residuals less their parameters from which the sigmas are scaled down as well as up."""
+"""Degrees of freedom from which residuals may also reduce the sigmas."""
 
 
 @dataclass(frozen=True)
 class PictureStar:
-    """A star on a picture, in pixels: where it is seen, and that minus where it should be."""
+    """An identified star on a picture: its measured place, and its residual, in pixels."""
 
     id: str
     name: str | None
     row: int
-    """The rows of the bright stars that the picture was compared with."""
+    """The row of the star in the list of bright stars."""
     magnitude_v_mag: float
     u_px: float
     v_px: float
@@ -95,13 +95,13 @@ class PictureStar:
 
 @dataclass(frozen=True)
 class PictureAttitude:
-    """The attitude and the lens of a picture.
+    """The attitude and the lens of a solved picture.
 
-    `attitude` (3, 3) turns ICRS into the camera's axes: x to the right of the picture, y
-    down, z to the sky through the middle of the picture.  `covariance_rad2` (3, 3) is of the
-    small rotation about these axes.  Sigmas are scaled by `sigma_scale`, which the residuals
-    gave.  The covariance also holds what the stars' errors may have in common, `shared_px`,
-    and how far the lens's last terms turn the attitude: these do not average down.
+    `attitude` (3, 3) turns ICRS into the camera's axes: x to the right of the picture, y down, z to
+    the sky through the middle of the picture. `covariance_rad2` (3, 3) is of the small rotation
+    about these axes. Sigmas are scaled by `sigma_scale`, which the residuals gave. The covariance
+    also holds the possible common error of the stars, `shared_px`, and the rotation of the attitude
+    by the lens's last terms: these do not average down.
     """
 
     attitude: Matrix
@@ -118,7 +118,7 @@ class PictureAttitude:
 
     @property
     def lens(self) -> Lens:
-        """The lens that was fitted; its own axis need not be in the middle of the picture."""
+        """The fitted lens, whose optical axis may be off the middle of the picture."""
         return self.fit.lens
 
     @property
@@ -128,19 +128,19 @@ class PictureAttitude:
 
     @cached_property
     def quaternion(self) -> Vector:
-        """Scalar last, inertial to camera."""
+        """The picture's attitude as a quaternion, scalar last, inertial to camera."""
         return quaternion_from_matrix(self.attitude)
 
     @property
     def sigma_arcsec(self) -> Vector:
-        """One standard deviation (3,) about each axis of the camera."""
+        """One standard deviation (3,) of the attitude about each axis of the camera, in arcsec."""
         return np.asarray(np.sqrt(np.diag(self.covariance_rad2)) * ARCSEC_PER_RADIAN)
 
     @property
     def sigma_share(self) -> float:
-        """The largest sigma as a share of the picture's longer side.
+        """The largest sigma of the attitude, as a share of the picture's longer side.
 
-        That about z is taken where it moves the ends of that side.
+        The sigma about z is converted to the displacement of that side's ends.
         """
         across, about = self.sigma_arcsec[:2].max(), self.sigma_arcsec[2]
         side = max(self.lens.width_px, self.lens.height_px)
@@ -149,12 +149,12 @@ class PictureAttitude:
 
     @property
     def boresight_deg(self) -> tuple[float, float]:
-        """Right ascension and declination of the middle of the picture."""
+        """Right ascension and declination of the middle of the picture, in degrees."""
         return ra_dec_of(self.attitude[2])
 
     @property
     def roll_deg(self) -> float:
-        """The position angle of the picture's upper edge: from north through east, 0 to 360."""
+        """Position angle of the picture's upper edge, from north through east, 0 to 360 degrees."""
         toward, up = self.attitude[2], -self.attitude[1]
         east = np.array([-toward[1], toward[0], 0.0])
         north = np.cross(toward, east)
@@ -162,7 +162,7 @@ class PictureAttitude:
 
     @property
     def field_deg(self) -> tuple[float, float]:
-        """The angles that the picture's width and height span through its middle."""
+        """The angles in degrees that the picture's width and height span through its middle."""
         lens = self.lens
         u = np.array([-0.5, lens.width_px - 0.5])
         v = np.array([-0.5, lens.height_px - 0.5])
@@ -172,11 +172,11 @@ class PictureAttitude:
         return _angle_deg(*across), _angle_deg(*down)
 
     def directions(self, u_px: Vector, v_px: Vector) -> Vector:
-        """Unit vectors (n, 3) in the camera's axes of places (n,) on the picture."""
+        """Unit vectors (n, 3) in the camera's axes for places (n,) on the picture."""
         return self.lens.directions(u_px, v_px) @ _of_the_middle(self.lens, np.eye(3)).T
 
     def sigma_of(self, number: int) -> float:
-        """One standard deviation of a parameter of the fit by its number; NaN if not fitted."""
+        """One standard deviation of a fitted parameter by its number; NaN if it was not fitted."""
         if number >= self.fit.parameters:
             return math.nan
         return float(math.sqrt(self.fit.covariance[number, number])) * self.sigma_scale
@@ -184,7 +184,7 @@ class PictureAttitude:
 
 @dataclass(frozen=True)
 class PictureResult:
-    """The result of a picture: candidates, attitude or None, and remarks in words."""
+    """The result for a picture: candidates, the attitude or None, and remarks in words."""
 
     frame: Frame
     points: PointSources
@@ -224,7 +224,7 @@ def solve_picture(
     for threshold, keep_hot in (
         (FIRST_THRESHOLD, False),
         (SECOND_THRESHOLD, False),
-        # Of a lens whose images of stars are much smaller than a pixel.
+        # For a lens whose star images are much smaller than a pixel.
         (FIRST_THRESHOLD, True),
     ):
         if keep_hot and not tried[0].hot_pixels:
@@ -405,13 +405,13 @@ def _averaged(frame: Frame) -> Iterator[tuple[Frame, str]]:
 
 
 def _refused_trails(frame: Frame, points: PointSources) -> PictureResult:
-    """The result of a picture whose stars moved in a way that tells no attitude."""
+    """The result for a picture with star trails that give no attitude."""
     nothing = BlindResult(None, -math.inf, 0, 0, 0, False)
     return PictureResult(frame, points, None, nothing, (trail_refusal(points),))
 
 
 def trail_refusal(points: PointSources) -> str:
-    """Message that a picture with trailed stars has no attitude, with the reason and remedies."""
+    """A message that a picture with star trails has no attitude, with the reason and remedies."""
     return (
         f"trailed: stars moved by about {points.trail_px:.0f} px during the exposure, "
         f"{points.trailed}: where they were at mid exposure cannot be told; use a shorter "
@@ -428,7 +428,7 @@ def _solved(
     guess_px: float | None,
     trials: int = 1,
 ) -> PictureResult:
-    """The result of one range of focal lengths; without an attitude it has no remarks."""
+    """The result for one range of focal lengths; without an attitude it has no remarks."""
     places = places_of(points)
     search = solver.solve(places, focal, trials)
     if search.found is None:
@@ -446,13 +446,13 @@ def _solved(
 
 @lru_cache(maxsize=2)
 def blind_sky(catalog: Catalog, year: int | None = None) -> tuple[BrightStars, BlindSolver]:
-    """The bright stars of a catalog in a year, by default this one, and the solver over them."""
+    """The bright stars of a catalog in a year, by default this one, and a blind solver for them."""
     sky = bright_stars(catalog, round(utc_now().julian_year) if year is None else year)
     return sky, BlindSolver(sky.direction)
 
 
 def places_of(points: PointSources) -> Points:
-    """The candidates as the solver takes them."""
+    """The candidates of a picture in the form that the blind solver takes."""
     return Points(points.u_px, points.v_px, points.sigma_px, points.width_px, points.height_px)
 
 
@@ -473,14 +473,14 @@ def _attitude(
         moved = apparent(sky.direction[row], velocity_c, time)
         about = fit.attitude @ rotation_between(sky.direction[row], moved)
     jacobian = _turns_of_the_middle(fit)
-    # Of the residuals a few stars leave little: what they had in common is not seen at all.
+    # A fit to few stars absorbs the error that they share.
     u_px, v_px, variance_px2 = places.u_px[seen], places.v_px[seen], found.rms_px**2
     shared_px2 = shared_variance_px2(u_px, v_px, found.residual_px, variance_px2)
     flux = points.flux_counts[seen] / (frame.exposure_s or 1.0)
     with np.errstate(divide="ignore", invalid="ignore"):
         zero = sky.magnitude_mag[row] + 2.5 * np.log10(flux)
     if (seen >= points.clipped_stars).any():
-        # The light of stars that are cut off is not known.
+        # The light of clipped stars is unknown.
         zero = zero[seen >= points.clipped_stars]
     zero = zero[np.isfinite(zero)]
     middle = float(np.median(zero)) if len(zero) else math.nan
@@ -504,7 +504,7 @@ def _attitude(
 def _systematic(
     found: Verified, u_px: Vector, v_px: Vector, star: Vector, shared_px2: float
 ) -> Matrix:
-    """The covariance (3, 3) of what does not average down, in square radians."""
+    """The covariance (3, 3) of attitude errors that more stars do not reduce, in rad²."""
     lens = found.fit.lens
     middle_u, middle_v = _middle(lens)
     arm_px2 = float(np.mean((u_px - middle_u) ** 2 + (v_px - middle_v) ** 2))
@@ -518,7 +518,7 @@ def _systematic(
 
 
 def _stars(found: Verified, seen: Any, points: PointSources, sky: BrightStars) -> Any:
-    """The matched stars, brightest first."""
+    """The matched stars of a picture, brightest first."""
     order = np.argsort(sky.magnitude_mag[found.star[seen]], kind="stable")
     for k in order.tolist():
         point, row = int(seen[k]), int(found.star[seen[k]])
@@ -539,7 +539,7 @@ def _middle(lens: Lens) -> tuple[float, float]:
 
 
 def _of_the_middle(lens: Lens, attitude: Matrix) -> Matrix:
-    """The attitude whose z goes through the middle of the picture, turned on the shortest way."""
+    """Attitude whose z axis goes through the middle of the picture, by the shortest rotation."""
     u, v = _middle(lens)
     x, y, z = lens.directions(np.array([u]), np.array([v]))[0].tolist()
     turn = np.array(
@@ -553,7 +553,9 @@ def _of_the_middle(lens: Lens, attitude: Matrix) -> Matrix:
 
 
 def _turns_of_the_middle(fit: LensFit) -> Matrix:
-    """How the attitude of the middle (3, p) turns, in radians, with every parameter of the fit."""
+    """The rotation (3, p) of the middle's attitude in radians per unit of every parameter of the
+    fit.
+    """
     turns = np.zeros((3, fit.parameters))
     unmoved = _of_the_middle(fit.lens, fit.attitude)
     step = 1e-6

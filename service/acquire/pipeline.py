@@ -1,13 +1,13 @@
-"""The pipeline: calibrate, search for the stars, solve for the attitude; of many batches at once.
+"""The pipeline for many batches at once: calibration, star identification, attitude.
 
-What all batches need is done for them together in compiled loops: directions in body axes
-(`correct_columns`), then votes, hypotheses and attitudes in the zones about the a priori
-attitudes (`ZoneSearch`).  Batches that need more go on from there one by one (`find_groups`): those
-where the zone gave nothing good, or nothing was known beforehand, and those with stars left that
-may have an attitude of their own.
+Common steps are done for all batches together in compiled loops: directions in body axes
+(`correct_columns`), then votes, hypotheses and attitudes in the zones about the a priori attitudes
+(`ZoneSearch`). Other batches continue from there one by one (`find_groups`): those without a good
+result in the zone or without prior knowledge, and those with unexplained stars that may have a
+second attitude.
 
-An answer depends on the batch, the mission and the catalog alone, not on the batches that come
-with it.  Not finding a star is a result; only bad input raises.
+An answer depends only on the batch, the mission and the catalog, not on the other batches. Not
+finding a star is a result; only bad input raises an error.
 """
 
 import operator
@@ -57,15 +57,15 @@ from service.sky.ephemeris import sun_distance_au
 from service.sky.model import SkyModel
 
 SHORT_WORK = 100_000
-"""The most units of work of what is solved at once: seven milliseconds."""
+"""Work limit in units of a batch solved without waiting, about seven milliseconds."""
 
 
 class ResultColumns(Struct, frozen=True, eq=False):
-    """The results of n batches, a row for each; see `CorrectedColumns` and `ZoneSearch`.
+    """Results of n batches as columns with one row each; see `CorrectedColumns` and `ZoneSearch`.
 
-    `searches` has the settings of each row, `stars` the stars in body axes, and `zones` what was
-    found about the a priori attitudes, also of rows that went on from there.  `finished` has the
-    acquisitions of those that went on, and what kept a row from having one.
+    `searches` has the settings of each row, `stars` the stars in body axes, and `zones` the results
+    about the a priori attitudes, also for rows that continued. `finished` has the acquisitions of
+    those rows, or the errors that prevented them.
     """
 
     searches: dict[int, Search]
@@ -74,7 +74,7 @@ class ResultColumns(Struct, frozen=True, eq=False):
     finished: dict[int, Acquisition | Exception]
 
     def acquisition(self, row: int) -> Acquisition:
-        """One row as the acquisition of its batch; raises what kept it from having one."""
+        """The acquisition of the batch in a row; raises the error that prevented it."""
         acquired = self.acquisition_or_error(row)
         if isinstance(acquired, Exception):
             raise acquired
@@ -92,12 +92,11 @@ class ResultColumns(Struct, frozen=True, eq=False):
 def acquire(
     batch: ObservationBatch, mission: Mission, sky: SkyModel, *, at_once: bool = False
 ) -> Acquisition:
-    """Identify a batch's stars and solve for the attitude: `acquire_many` of one batch.
+    """Identify the stars of one batch and solve for its attitude; see `acquire_many`.
 
-    Without a priori knowledge, or where it leads to nothing good, the whole sky
-    gives the attitude to search about.  Raises `BadInput` for what does not fit
-    the mission: a tracker that it has not, a kind of a priori knowledge that its
-    zone cannot use.
+    Without a priori knowledge, or if it gives no good result, a search of the whole sky gives the
+    attitude to search about. Raises `BadInput` for data that do not fit the mission: an unknown
+    tracker, or a kind of prior that its zone cannot use.
     """
     columns = acquire_many(BatchColumns.of([batch]), mission, sky, at_once=at_once)
     return columns.acquisition(0)
@@ -116,9 +115,9 @@ def acquire_many(
 ) -> ResultColumns:
     """Identify the stars of many batches of one mission, and solve for their attitudes.
 
-    A faulty batch gets its error, the others their results.  `at_once` is for callers that must
-    not wait: a row has `NotAtHand` where the whole sky is searched, a zone has to be built, or
-    more work is counted than `SHORT_WORK`.  The answers of the others are the same.
+    A faulty batch gets its error, the others their results. `at_once` is for callers that must not
+    wait: a row gets `NotAtHand` if it needs the whole sky, a new zone, or more work than
+    `SHORT_WORK`. The other answers are the same.
     """
     sky = sky.at_hand() if at_once else sky
     timer = StepTimer(len(batches.batches))
@@ -140,12 +139,12 @@ def acquire_many(
                 budget = WorkBudget(SHORT_WORK if at_once else MAX_WORK)
                 searches[row] = _search(batch, mission, sky, timer, budget)
         except Exception as error:
-            # Whatever fails for one batch is its result: the others go on.
+            # A failure of one batch is its result: the others continue.
             finished[row] = as_row_error(error)
         several.append(batch)
         trackers += its_trackers
     if not all(map(operator.is_, several, batches.batches)):
-        # Scans became angles.
+        # Readings of scanning trackers became angles.
         batches = BatchColumns.of(several)
     stars = correct_columns(batches, trackers)
     timer.begin()
@@ -155,7 +154,7 @@ def acquire_many(
             try:
                 zones.add(row, search, search.prior)
             except Exception as error:
-                # As above: the others go on.
+                # As above, the others continue.
                 finished[row] = as_row_error(error)
     zones.run(timer)
     finished |= zones.errors
@@ -171,7 +170,7 @@ def acquire_many(
 def _search(
     batch: ObservationBatch, mission: Mission, sky: SkyModel, timer: StepTimer, budget: WorkBudget
 ) -> Search:
-    """The conditions of the searches for a batch's stars."""
+    """The conditions of all searches for a batch's stars."""
     time, a_priori = batch.time, batch.a_priori
     return Search(
         batch=batch,
@@ -192,13 +191,13 @@ def _search(
 def _continued(
     search: Search, corrected: tuple[CorrectedObservations, ...], zones: ZoneSearch, row: int
 ) -> Acquisition | Exception:
-    """The acquisition of a batch that needs more than the zones about its a priori attitude."""
+    """Acquisition of a batch that needs more than a search in zones about its a priori attitude."""
     search = replace(search, timer=search.timer.of_one())
     first = zones.result(row) if row in zones else None
     try:
         return _composed(search, corrected, *find_groups(search, corrected, first))
     except Exception as error:
-        # The row's own result, as the callers of `acquire_many` expect.
+        # The error is the row's own result, as callers of `acquire_many` expect.
         return as_row_error(error)
 
 
@@ -208,7 +207,7 @@ def _composed(
     found: SearchResult,
     rival: RivalAttitude | None,
 ) -> Acquisition:
-    """The acquisition of a batch from what was found of its stars, with its warnings."""
+    """The acquisition of a batch, composed of search results, with its warnings."""
     batch, mission, prior = search.batch, search.mission, search.prior
     in_zones = found.in_zones
     solved = found.refusal if in_zones is None else in_zones.solved
@@ -246,7 +245,7 @@ def _composed(
 
 
 def _measured(batch: ObservationBatch, mission: Mission, sky: SkyModel) -> Acquisition:
-    """The acquisition of an attitude that a tracker measured itself."""
+    """The acquisition of an attitude measured by a tracker itself."""
     assert batch.measurement is not None
     run_catalog = sky.run_catalog(mission, batch.time)
     return Acquisition(

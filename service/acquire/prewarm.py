@@ -1,4 +1,4 @@
-"""Preparation: the kernels and the sky before the service is ready, zones on request."""
+"""Preparation before the service is ready: kernels and sky files; zones on request."""
 
 import json
 import math
@@ -23,19 +23,19 @@ from service.times import Utc, parse_utc
 from service.vectors import quaternion_from_matrix, rotate_about
 
 ORION = 84.0, -1.0
-"""A field with many bright stars: right ascension and declination, in degrees."""
+"""Right ascension and declination in degrees of a field with many bright stars."""
 BRIGHT_MAG = 4.0
-"""Limit of the warm-up catalog: few stars compile every kernel, and are indexed fast."""
+"""Magnitude limit of the warm-up catalog: few stars suffice to compile every kernel."""
 BRIGHTEST_MAG = 3.0
-"""Limit of the warm-up catalog where every pair and patch of the whole sky is indexed."""
+"""Brighter magnitude limit of the warm-up catalog where the whole sky is indexed."""
 
 
 def prewarm_sky(
     sky: SkyModel, missions: Iterable[Mission], time: Utc, whole_sky: bool = True
 ) -> None:
-    """Open the files that batches of missions and of a time need; those that are missing are built.
+    """Open, or build if missing, the files that batches of given missions and time need.
 
-    Run catalogs, and indexes of the whole sky unless these are not wanted.
+    These are run catalogs, and whole-sky indexes unless `whole_sky` is false.
     """
     for mission in missions:
         run_catalog = sky.run_catalog(mission, time)
@@ -45,7 +45,7 @@ def prewarm_sky(
 
 
 def prewarm_zones(sky: SkyModel, mission: Mission, prior: APriori, time: Utc) -> list[Zone]:
-    """Cache the zones that a batch of this a priori knowledge will need."""
+    """Build and cache the zones that a batch with given a priori knowledge will need."""
     presumed = prior_attitude(prior, time, mission)
     run_catalog = sky.run_catalog(mission, time)
     return [
@@ -66,16 +66,16 @@ def prewarm_kernels(
     identifiers: Collection[str] | None = None,
     seldom: bool = False,
 ) -> None:
-    """Load the kernels, or compile them, by running a batch of real stars of each kind of zone.
+    """Load or compile the kernels by acquiring a batch of real stars for each kind of zone.
 
-    Those of the named identifiers (None: of the missions' own and of the whole sky: to load
-    others takes a batch that needs them some ms), and what few of their batches need (`seldom`):
-    two groups of stars, match groups, a misaligned tracker.
-    The zones that this builds go into a cache of its own, which it drops at the end.
-    What builds run catalogs and indexes is compiled only for a sky that opens no files.
+    The kernels are those of the named identifiers, by default of the missions and of the whole sky
+    (a batch with another identifier loads its kernels in some ms), and with `seldom` those for rare
+    cases: two groups of stars, match groups, a misaligned tracker. Zones are built into a separate
+    cache, which is discarded. The code that builds run catalogs and indexes is compiled only for a
+    sky that opens no files.
     """
     moment = parse_utc("2000-01-01T12:00:00Z")
-    # Large enough that nothing is built twice on the way.
+    # Large enough that nothing is evicted and built twice.
     apart = SkyModel(sky.catalog, LruCache(max_bytes=256 << 20), opens_files=sky.opens_files)
     kinds = {mission.zone.kind: mission for mission in missions.values()}
     first = next(iter(kinds), None)
@@ -118,15 +118,16 @@ def prewarm_kernels(
                 continue
             if not identifier.searches_zone and kind != first:
                 continue  # the same kernels
-            # From JSON, as batches are posted: kernels are compiled for that kind of array.
-            # One zone on the mission's grid, where more is to be worked out; the others are small.
+            # From JSON, like posted batches, since kernels are compiled for that kind of array. One
+            # zone is on the mission's grid, which needs more code; the others are small.
             exact = {} if identifier.name == "starid" else {"zone_grid_deg": 0.0}
             options = {"identifier": identifier.name} | exact
             batch = submission_from_json(json.dumps(body | {"options": options})).batch
             brightest = _of_bright_stars(original, BRIGHTEST_MAG)
             searched = mission if identifier.uses_prior else brightest
             if identifier.searches_zone:
-                # So few stars may not be enough, and the whole sky has kernels of its own.
+                # The warm-up batch is small; keep it from falling back to the whole sky, which is
+                # warmed by itself.
                 searched = searched.model_copy(update={"lost_in_space_fallback": False})
             acquire(batch, searched, apart)
         if seldom and kind == first:
@@ -143,7 +144,7 @@ def compile_beside_batches() -> None:
 def _prewarm_seldom(
     sky: SkyModel, mission: Mission, body: dict[str, Any], identifiers: Collection[str]
 ) -> None:
-    """Compile what two groups of stars need, or votes in steps and a misaligned tracker."""
+    """Compile the kernels for two groups of stars, or for group votes and a misaligned tracker."""
     (seen,) = body["observations"]
     tracker, stars = mission.trackers[0], seen["stars"]
 

@@ -1,4 +1,4 @@
-"""The result of one batch: per tracker, the attitude, a rival, where it came from; warnings."""
+"""The result of one batch: tracker results, the attitude, a rival, provenance, and warnings."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from enum import StrEnum
@@ -35,17 +35,19 @@ from service.vectors import (
 )
 
 TrackingState = Literal["acquiring", "tracking", "lost"]
-"""How a batch was found: in the whole sky, about a prediction, or with no good attitude."""
+"""Tracking states of a batch: found in the whole sky, near a prediction, or without a good
+attitude.
+"""
 _COUNTED = [
     (int(each), each.word) for each in (Outcome.UNIQUE, Outcome.AMBIGUOUS, Outcome.UNMATCHED)
 ]
 
 
 class Place(Struct, frozen=True, eq=False, gc=False):
-    """The region in which the stars of a tracker were searched for; `cached` if its zone was.
+    """The region in which a tracker's stars were searched; `cached` if its zone was in the cache.
 
-    `stars` and `pairs` are those within the region, the paper's NCAP and NTOT; the zone, from the
-    cache, may hold more.
+    `stars` and `pairs` are the numbers within the region, the paper's NCAP and NTOT; the cached
+    zone may have more.
     """
 
     region: SearchRegion
@@ -55,11 +57,11 @@ class Place(Struct, frozen=True, eq=False, gc=False):
 
 
 class TrackerResult(Struct, frozen=True, eq=False, gc=False):
-    """One tracker's part: where its stars were looked for, and what was found.
+    """One tracker's part of a result: its search region, identification and residuals.
 
-    `stars`, `pairs` and `zone_cached` are as in `Place`.  The region is None where
-    the whole sky gave no attitude to search about.  `residual_arcsec` is NaN for
-    stars that are not unique and where there is no attitude.
+    `stars`, `pairs` and `zone_cached` are as in `Place`. The region is None if the whole sky gave
+    no attitude to search about. `residual_arcsec` is NaN for stars that are not unique and without
+    an attitude.
     """
 
     corrected: CorrectedObservations
@@ -76,15 +78,15 @@ class Path(StrEnum):
 
     ZONE = "zone"
     LOST_IN_SPACE = "lost_in_space"
-    """The whole sky was searched: no a priori attitude was given, or its use was disabled."""
+    """A search of the whole sky: no a priori attitude was given, or its use was disabled."""
     MEASURED = "measured"
-    """A tracker measured the attitude itself; nothing was searched for."""
+    """A tracker measured the attitude itself, without a search for stars."""
     ZONE_THEN_LOST_IN_SPACE = "zone_then_lost_in_space"
-    """Nothing good was found about the a priori attitude, and the whole sky was searched."""
+    """The a priori attitude gave no good result, and the whole sky was searched."""
 
 
 class Provenance(Struct, frozen=True, eq=False, gc=False):
-    """The catalogs, the mission file and the program that an answer was made with."""
+    """The catalogs, mission file and program version from which an answer was made."""
 
     catalog: str
     run_catalog: str
@@ -94,11 +96,11 @@ class Provenance(Struct, frozen=True, eq=False, gc=False):
 
 
 class RivalAttitude(Struct, frozen=True, eq=False, gc=False):
-    """A second attitude, which explains a group of stars that the first one leaves unexplained.
+    """A second attitude, for a group of stars that the first one leaves unexplained.
 
-    `star` (n,) of every tracker are rows of the run catalog, -1 for stars that are
-    not in its group.  `probability` is its share of the two; `angle_deg` the
-    rotation between them.
+    `star` (n,) has, for every tracker, rows of the run catalog, -1 for stars outside of the group.
+    `probability` is that of this attitude against the first; `angle_deg` is the rotation between
+    the two.
     """
 
     solution: AttitudeSolution
@@ -108,13 +110,12 @@ class RivalAttitude(Struct, frozen=True, eq=False, gc=False):
 
 
 class Acquisition(Struct, frozen=True, eq=False, gc=False):
-    """The result of one batch.
+    """The result of acquiring one batch.
 
-    `solution` is None where `reason` says why; never an older attitude.  Where a
-    `rival` is named, the stars that the solution leaves unexplained have an
-    attitude of their own, and the solution is suspect.
-    `prior` is the batch's a priori attitude, None without any.
-    `counts` are of the stars observed, and of them unique, ambiguous and unmatched.
+    `solution` is None if `reason` is set; it is never an older attitude. With a `rival`, the stars
+    that the solution leaves unexplained have a different attitude, and the solution is suspect.
+    `prior` is the batch's a priori attitude, None without any. `counts` has the numbers of stars
+    observed, unique, ambiguous and unmatched.
     """
 
     batch: ObservationBatch
@@ -134,9 +135,10 @@ class Acquisition(Struct, frozen=True, eq=False, gc=False):
 
     @property
     def tracking_state(self) -> TrackingState | None:
-        """The state that a batch that asks for the last attitude leaves its spacecraft in.
+        """The tracking state of the spacecraft after a batch that asks for the last attitude.
 
-        A batch without an attitude is tracked where the prediction identified a star of it.
+        A batch without an attitude counts as tracking if the prediction identified one of its
+        stars.
         """
         if self.batch.tracking is None:
             return None
@@ -154,7 +156,7 @@ def tracker_results(
     identifications: Sequence[Identification],
     solution: AttitudeSolution | None,
 ) -> tuple[TrackerResult, ...]:
-    """The results of the trackers, whose zones and identifications are in the same order."""
+    """The results of trackers from their zones, identifications and the solution's residuals."""
     results = []
     first = 0
     for each, place, identification in zip(corrected, places, identifications, strict=True):
@@ -167,7 +169,7 @@ def tracker_results(
 
 
 def unmatched_results(corrected: Sequence[CorrectedObservations]) -> tuple[TrackerResult, ...]:
-    """The results of trackers whose stars could not be searched for: all are unmatched."""
+    """The results of trackers whose stars could not be searched for: all unmatched."""
     counts = [len(each.magnitude_mag) for each in corrected]
     return tuple(
         TrackerResult(each, None, False, 0, 0, nothing_known(n), not_known(n))
@@ -176,7 +178,7 @@ def unmatched_results(corrected: Sequence[CorrectedObservations]) -> tuple[Track
 
 
 def outcome_counts(trackers: Sequence[TrackerResult]) -> dict[str, int]:
-    """The number of stars observed, and of each outcome by its word."""
+    """The number of observed stars, and of each outcome by its word."""
     found = [outcome for each in trackers for outcome in each.identification.outcome.tolist()]
     counts = {"observed": len(found)}
     for number, word in _COUNTED:
@@ -189,11 +191,11 @@ _UNKNOWN = np.nan
 
 
 def measured_solution(measured: MeasuredAttitude, mission: Mission) -> AttitudeSolution:
-    """The attitude of the body that a tracker measured, with its covariance about the body axes.
+    """The body's attitude measured by a tracker itself, with its covariance about the body axes.
 
-    With the alignment body = B @ tracker it is B A, and the covariance B P B^T.  There are no
-    residuals: they, and what they would tell, are NaN.  Raises `BadInput` naming the field
-    for a tracker that the mission has not.
+    With the alignment body = B @ tracker it is B A, and the covariance B P B^T. Residuals and the
+    values derived from them are NaN. Raises `BadInput` naming the field for a tracker unknown to
+    the mission.
     """
     attitude = matrix_from_quaternion(measured.quaternion)
     covariance = measured.covariance_arcsec2
@@ -222,7 +224,7 @@ def measured_solution(measured: MeasuredAttitude, mission: Mission) -> AttitudeS
 # ---- warnings of an answer: a code, a colon, and a sentence -----------------------------------
 
 WORK_BOUND_HIT = "work_bound_hit"
-"""The code of the warning that a search ended at its bound on the work."""
+"""The code of the warning that a search ended at its work limit."""
 
 PREDICTION_CONTRADICTED = (
     "prediction_contradicted: the attitude found about the predicted one lies too far from it "
@@ -235,11 +237,11 @@ NO_PREDICTION = {
 }
 NEAR_AXIS_COS = 0.9998
 FLIP_DEG = 5.0
-"""A turn by more about the zone's axis is called one of the roll."""
+"""Rotation in degrees about the zone's axis above which a difference is called a roll."""
 
 
 def warnings_of_batch(batch: ObservationBatch, mission: Mission) -> list[str]:
-    """Warnings about the batch itself, whatever was found."""
+    """Warnings about the batch itself, independent of the result."""
     warnings, options = list(batch.remarks), batch.options
     if options.tests or options.tolerances:
         off = [name for name in impossible_tests(batch, mission) if options.tests.get(name)]
@@ -263,7 +265,7 @@ def warnings_of_batch(batch: ObservationBatch, mission: Mission) -> list[str]:
 def warnings_of_attitude(
     solution: AttitudeSolution, mission: Mission, prior: PriorAttitude | None
 ) -> list[str]:
-    """Warnings that an attitude's own residuals, or the a priori knowledge, speak against it."""
+    """Warnings that an attitude contradicts its own residuals or the a priori knowledge."""
     warnings = []
     if solution.taste > taste_bound(solution.degrees_of_freedom):
         warnings.append(
@@ -290,7 +292,7 @@ def warnings_of_tracking(
     prior: PriorAttitude | None,
     is_in_zone: bool,
 ) -> list[str]:
-    """Warnings that nothing was predicted, or that the prediction did not hold."""
+    """Warnings that no attitude was predicted, or that the prediction was wrong."""
     tracking = batch.tracking
     if tracking is not None and tracking.reason is not None:
         return [f"not_tracked: {NO_PREDICTION[tracking.reason]}"]
@@ -312,7 +314,7 @@ def warnings_of_tracking(
 
 
 def warning_of_rival(rival: RivalAttitude) -> str:
-    """The warning that other stars have an attitude of their own."""
+    """The warning that other stars have a different attitude."""
     others = sum(int((star >= 0).sum()) for star in rival.star)
     return (
         f"rival_attitude: {others} stars that this attitude leaves unexplained have one of "
@@ -321,7 +323,7 @@ def warning_of_rival(rival: RivalAttitude) -> str:
 
 
 def warnings_of_trackers(trackers: Iterable[TrackerResult], attitude: Matrix) -> list[str]:
-    """Warnings about the identification of each tracker, at the attitude solved for or presumed."""
+    """Warnings about each tracker's identification, at the solved or presumed attitude."""
     warnings = []
     for each in trackers:
         tracker, region = each.corrected.tracker, each.region

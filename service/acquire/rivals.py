@@ -1,7 +1,7 @@
-"""Two groups of stars in one batch, each with an attitude of its own.
+"""Two groups of stars in one batch, with an attitude each.
 
-Reflections double every star, and a slew within a batch halves them.  The
-heavier group becomes the answer, the lighter one its rival.
+Reflections double every star, and a slew within a batch splits the stars. The group of larger
+weight becomes the answer, the other one its rival.
 """
 
 import math
@@ -19,20 +19,24 @@ from service.observations.calibrate import CorrectedColumns, CorrectedObservatio
 from service.vectors import attitude_error_arcsec, read_only
 
 FEWEST_NAMED = 2
-"""Fewest stars of a second group that one tracker must name: two vectors fix an attitude."""
+"""Least number of identified stars of a second group in one tracker: two vectors fix an
+attitude.
+"""
 DIFFERENT_CHI_SQUARE = 30.0
-"""Chi-square with three degrees of freedom that two attitudes of noise alone pass in 1e-6."""
+"""Chi-square (three degrees of freedom) that the difference of two equal attitudes exceeds in
+1e-6.
+"""
 
 
 def find_groups(
     search: Search, corrected: tuple[CorrectedObservations, ...], first_found: ZoneResult | None
 ) -> tuple[SearchResult, RivalAttitude | None]:
-    """Identify the stars; where two groups have each an attitude, the lighter is the rival.
+    """Identify the stars; if two groups have an attitude each, the lighter group is the rival.
 
-    The stars that the answer leaves unexplained are acquired by themselves, the
-    same way.  Where nothing good was found for all, so are those of the
-    likeliest hypothesis: two groups of like weight leave every star ambiguous.
-    `first_found` is what was found of all about the a priori attitude, if that was searched.
+    The stars that the answer leaves unexplained are acquired separately in the same way. If all
+    stars together gave no good result, so are those of the most likely hypothesis, since two groups
+    of similar weight leave every star ambiguous. `first_found` is the result for all stars about
+    the a priori attitude, if that was searched.
     """
     found = find(search, corrected, first_found)
     if not search.identifier.weighs_hypotheses or not any(mask.any() for mask in found.explained):
@@ -45,20 +49,20 @@ def find_groups(
         explained = _group(search, corrected, found.explained)
         if explained is None:
             return found, None
-        # The likeliest hypothesis may have stars of the other group, and not all of its own.
+        # The most likely hypothesis may include stars of the other group, and miss some of its own.
         other = _group(search, corrected, [~mask for mask in explained.unique]) or other
         first = _group(search, corrected, [~mask for mask in other.unique]) or explained
     elif not _differ(found.solution, other.solution):
-        # Another tracker decided for this group: then the hypothesis is what is left over.
+        # Another tracker decided for this group: then the hypothesis gives the remaining stars.
         left = [mask & ~each for mask, each in zip(found.explained, found.unique, strict=True)]
         other = _group(search, corrected, left)
     else:
-        # Among stars of both groups the search of the whole sky leaves some of the first unnamed.
+        # With stars of both groups the search of the whole sky leaves some of the first unnamed.
         alone = _group(search, corrected, [~mask for mask in other.unique])
         if alone is not None and _differ(alone.solution, other.solution):
             first = alone
     if other is None or not _differ(first.solution, other.solution):
-        # The same attitude twice: every star was sent twice, say.
+        # The same attitude twice, for example because every star was sent twice.
         return found, None
     return _weigh(search, corrected, first, other)
 
@@ -66,10 +70,10 @@ def find_groups(
 def _group(
     search: Search, corrected: tuple[CorrectedObservations, ...], masks: Sequence[groups.Mask]
 ) -> SearchResult | None:
-    """The search for these stars alone, as of all; None where they have no attitude.
+    """The search for a subset of stars, expanded to all stars; None if the subset has no attitude.
 
-    There must be three stars, two of which are named: the others may lie beyond the zone.
-    An attitude that its residuals speak against counts: one sound group in a thousand has such.
+    The subset needs three stars, two of them identified, since the others may lie outside of the
+    zone. An attitude with suspect residuals counts: one sound group in a thousand has these.
     """
     if not groups.may_be_a_group(masks):
         return None
@@ -86,7 +90,7 @@ def _weigh(
     one: SearchResult,
     other: SearchResult,
 ) -> tuple[SearchResult, RivalAttitude]:
-    """The heavier of two groups as the answer, the lighter as its rival."""
+    """The heavier of two groups as the answer, and the lighter one as its rival."""
     weights = _log_weight(search, corrected, one), _log_weight(search, corrected, other)
     if weights[0] < weights[1]:
         one, other, weights = other, one, weights[::-1]
@@ -113,7 +117,7 @@ def _log_weight(
 ) -> float:
     """The log weight of all stars under the attitude of one group, up to a common constant.
 
-    The prior is the a priori attitude; without one, the attitude that was found.
+    The prior is the a priori attitude, or else the attitude that was found.
     """
     in_zones = found.in_zones
     assert in_zones is not None
@@ -132,7 +136,7 @@ def _log_weight(
 
 
 def _differ(one: AttitudeSolution, other: AttitudeSolution) -> bool:
-    """True if two attitudes of different stars differ by more than their noise explains."""
+    """True if the attitudes of two groups of stars differ by more than their noise explains."""
     apart_arcsec = attitude_error_arcsec(other.matrix, one.matrix)
     covariance_arcsec2 = one.covariance_arcsec2 + other.covariance_arcsec2
     weighted = float(apart_arcsec @ np.linalg.solve(covariance_arcsec2, apart_arcsec))
@@ -140,7 +144,7 @@ def _differ(one: AttitudeSolution, other: AttitudeSolution) -> bool:
 
 
 def _of_all(found: SearchResult, masks: Sequence[groups.Mask]) -> SearchResult:
-    """The search for a part of the stars as one of all, the others unmatched."""
+    """The search result for a subset of stars, expanded to all stars with the others unmatched."""
     in_zones, solution = found.in_zones, found.solution
     assert in_zones is not None
     every = np.concatenate(masks)

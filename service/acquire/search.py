@@ -1,4 +1,4 @@
-"""The search for the stars of a batch: about the a priori attitude, or in the whole sky."""
+"""The search for the stars of a batch about the a priori attitude, or in the whole sky."""
 
 import math
 from collections.abc import Sequence
@@ -33,13 +33,13 @@ from service.vectors import (
 )
 
 CONTRADICTED_CHI_SQUARE = 30.0
-"""Chi-square with three degrees of freedom that a right prediction passes in 1e-6."""
+"""Chi-square (three degrees of freedom) that the error of a correct prediction exceeds in 1e-6."""
 
 
 class SearchResult(Struct, frozen=True, eq=False, gc=False):
-    """The result for some stars of a batch: the path, the result in zones, or why none.
+    """The result for some stars of a batch: the search path, and the result in zones or a refusal.
 
-    `explained` (n,) of every tracker marks the stars of the likeliest hypothesis.
+    `explained` (n,) marks, for every tracker, the stars that the most likely hypothesis explains.
     """
 
     path: Path
@@ -55,13 +55,13 @@ class SearchResult(Struct, frozen=True, eq=False, gc=False):
 
     @property
     def unique(self) -> list[Mask]:
-        """The stars (n,) of every tracker that are unique; only where zones were searched."""
+        """True for the unique stars (n,) of every tracker; requires a result in zones."""
         assert self.in_zones is not None
         return [each.unique for each in self.in_zones.identifications]
 
     @property
     def solution(self) -> AttitudeSolution:
-        """The attitude; only where there is one."""
+        """The attitude solution; requires that there is one."""
         assert self.in_zones is not None
         assert isinstance(self.in_zones.solved, AttitudeSolution)
         return self.in_zones.solved
@@ -70,9 +70,9 @@ class SearchResult(Struct, frozen=True, eq=False, gc=False):
 def find(
     search: Search, corrected: tuple[CorrectedObservations, ...], first: ZoneResult | None = None
 ) -> SearchResult:
-    """Identify these stars about the a priori attitude, else in the whole sky.
+    """Identify stars about the a priori attitude, or else in the whole sky.
 
-    `first` is the result about the a priori attitude where it is there already.
+    `first` is the result about the a priori attitude if it is known already.
     """
     prior, path = search.prior, Path.LOST_IN_SPACE
     in_zones = refusal = None
@@ -83,7 +83,7 @@ def find(
         warnings += prior.warnings
         falls_back = _falls_back(search, corrected, in_zones)
         if contradicts(in_zones, prior):
-            # The stars that were named stand or fall with the attitude.
+            # The named stars are as wrong as the attitude.
             in_zones, refusal = None, NoAttitude.FEWER_THAN_THREE_STARS
             falls_back = _whole_sky_can_tell(corrected)
             explained = tuple(np.zeros(len(each.sigma_rad), bool) for each in corrected)
@@ -132,7 +132,7 @@ def find(
 
 
 def _presumed(search: Search, attitude: Matrix) -> PriorAttitude:
-    """The attitude that the whole sky gave, to search about as about the a priori one."""
+    """The attitude found in the whole sky, in the form of a priori knowledge."""
     prior = QuaternionPrior(read_only(quaternion_from_matrix(attitude)))
     if search.prior is not None and search.prior.predicted is not None:
         # The tests of the batch are those of a cap.
@@ -141,7 +141,7 @@ def _presumed(search: Search, attitude: Matrix) -> PriorAttitude:
 
 
 def _with_found_stars(search: Search, found: FoundAttitude, in_zones: ZoneResult) -> ZoneResult:
-    """The result in zones with the stars of the whole sky in place of those of the zones."""
+    """A result in zones with its identifications replaced by those of the whole sky."""
     identifications = [
         replace(
             nothing_known(len(star)),
@@ -162,7 +162,7 @@ def _with_lone_stars(
     in_zones: ZoneResult,
     predicted: PredictedPrior,
 ) -> ZoneResult:
-    """The result in zones, with the stars that the prediction identifies if it is poor."""
+    """A result in zones; without an attitude, completed by stars that the prediction identifies."""
     if isinstance(in_zones.solved, AttitudeSolution):
         return in_zones
     identifications = identify_lone_stars(
@@ -185,7 +185,7 @@ def find_about(
     prior: PriorAttitude,
     budget: WorkBudget | None = None,
 ) -> ZoneResult:
-    """Identify stars in the zones about a presumed attitude, and solve for theirs."""
+    """Identify stars in the zones about a presumed attitude, and solve for the attitude."""
     zones = ZoneSearch(CorrectedColumns.of(corrected))
     zones.add(0, search, prior, budget)
     zones.run(search.timer)
@@ -216,9 +216,9 @@ def _solve(
 def _falls_back(
     search: Search, corrected: Sequence[CorrectedObservations], in_zones: ZoneResult
 ) -> bool:
-    """True if the result about the a priori attitude is so poor that the sky is searched.
+    """True if the result about the a priori attitude is so poor that the whole sky is searched.
 
-    A prediction may fail at any time: its batch is without other knowledge then.
+    A prediction may fail at any time, which leaves its batch without prior knowledge.
     """
     identifier = search.identifier
     is_allowed = identifier.falls_back and search.mission.lost_in_space_fallback
@@ -228,7 +228,7 @@ def _falls_back(
 
 
 def contradicts(in_zones: ZoneResult, prior: PriorAttitude) -> bool:
-    """True if an attitude that was found about a prediction cannot be the predicted one."""
+    """True if the attitude found about a prediction contradicts the prediction."""
     predicted, solved = prior.predicted, in_zones.solved
     if predicted is None or not isinstance(solved, AttitudeSolution):
         return False
@@ -242,18 +242,18 @@ def _whole_sky_can_tell(corrected: Sequence[CorrectedObservations]) -> bool:
     return any(len(each.magnitude_mag) >= FEWEST_POINTS for each in corrected)
 
 
-# Stars of a batch that is too poor for an attitude, identified by the predicted one.
-#
-# One star has no pair that could tell it from others.  Where the attitude is predicted well
-# enough, its place and its magnitude tell: a catalog star is weighed against chance, which is
-# a point that is no star, or a prediction that has failed.
+# Identification of single stars by a predicted attitude, for batches too poor for an attitude. One
+# star has no pair to distinguish it. With an accurate prediction its place and magnitude do: a
+# catalog star is weighed against chance, which is a point that is no star, or a failed prediction.
 
 CLUTTER = 0.1
-"""The probability that a point is no catalog star, as `hypotheses.evidence` expects it."""
+"""Probability that a point is no catalog star, equal to the prior mean in `hypotheses.evidence`."""
 FAILED = 0.01
-"""The probability that a prediction has failed, as at a flip that no mission declares."""
+"""Probability that a prediction has failed, for example at a flip that the mission does not
+declare.
+"""
 GATE = 30.0
-"""Chi-square with two degrees of freedom beyond which catalog stars weigh nothing."""
+"""Chi-square (two degrees of freedom) beyond which catalog stars have no weight."""
 
 
 def identify_lone_stars(
@@ -264,18 +264,18 @@ def identify_lone_stars(
     run_catalog: RunCatalog,
     inertial: Vector,
 ) -> list[Identification]:
-    """The identifications with the stars that a predicted attitude identifies by itself.
+    """Identifications completed by the stars that a predicted attitude identifies by itself.
 
     `attitude` (3, 3), inertial to body, is the predicted one with its covariance about the body
-    axes; `inertial` (N, 3) are the apparent directions of the run catalog's stars.  A star is
-    unique from the same probability on as under `verified`.
+    axes; `inertial` (N, 3) are the apparent directions of the run catalog's stars. A star is unique
+    from the same probability as under `verified`.
     """
     found = [
         _of_tracker(each, identified, attitude, covariance_arcsec2, run_catalog, inertial)
         for each, identified in zip(corrected, identifications, strict=True)
     ]
     rows = [int(row) for each in found for row in each.star if row >= 0]
-    # Of two points that are one star nothing tells which it is.
+    # Two detections of one star cannot be told apart.
     return found if len(set(rows)) == len(rows) else list(identifications)
 
 
@@ -338,14 +338,14 @@ def _likeliest(
     catalog_mag: Vector,
     chance: float,
 ) -> tuple[int, float]:
-    """The likeliest catalog star at a point in body axes, and its probability; else -1 and 0.
+    """The most likely catalog star at a point in body axes, and its probability; else -1 and 0.
 
-    `chance` is the density of what else may be there, per steradian.
+    `chance` is the density of false points per steradian.
     """
     first = np.cross(seen, np.eye(3)[int(np.argmin(np.abs(seen)))])
     first /= np.linalg.norm(first)
     across = np.stack([first, np.cross(seen, first)])
-    # A rotation about one axis across moves the point along the other.
+    # A rotation about one of the two perpendicular axes moves the point along the other.
     turned = np.stack([across[1], -across[0]])
     covariance = turned @ covariance_rad2 @ turned.T + sigma_rad**2 * np.eye(2)
     off = (predicted - seen) @ across.T

@@ -1,7 +1,7 @@
-"""The search in the zones about presumed attitudes, of many batches at once.
+"""The search for stars in zones about presumed attitudes, for many batches at once.
 
-Trackers are grouped by the zone that serves them, so that each zone is fetched once; its
-stars are identified, and then the attitudes solved for, in compiled loops.
+Trackers are grouped by the zone that serves them, so that each zone is fetched once; stars are
+identified, and then attitudes solved, in compiled loops.
 """
 
 from collections.abc import Hashable, Sequence
@@ -38,16 +38,17 @@ from service.vectors import Vector
 
 
 def as_row_error(error: Exception) -> Exception:
-    """An error as the result of a row.
+    """An error in the form stored as the result of a row.
 
-    Expected ones (`AcquisitionError`, `NotAtHand`) lose their traceback, which holds all columns.
+    Expected errors (`AcquisitionError`, `NotAtHand`) lose their traceback, which would keep all
+    columns in memory.
     """
     is_expected = isinstance(error, AcquisitionError | NotAtHand)
     return error.with_traceback(None) if is_expected else error
 
 
 class StepTimer:
-    """Time spent in each step, summed where a step is taken again, of one batch or of several."""
+    """The time spent in each step of the pipeline, summed, for one or more batches."""
 
     def __init__(self, batches: int = 1) -> None:
         self.ns = dict.fromkeys(("zone", "identify", "solve"), 0)
@@ -55,7 +56,7 @@ class StepTimer:
         self.begin()
 
     def begin(self) -> None:
-        """Leave out the time until now."""
+        """Start timing now, ignoring the time before."""
         self._last = perf_counter_ns()
 
     def end(self, step: str) -> None:
@@ -65,19 +66,19 @@ class StepTimer:
         self._last = now
 
     def of_one(self) -> "StepTimer":
-        """A timer that goes on for one of the batches, from its equal part of the time."""
+        """A timer for one of the batches, starting with its equal share of the time so far."""
         timer = StepTimer()
         timer.ns = {step: ns // self._batches for step, ns in self.ns.items()}
         return timer
 
     @property
     def us(self) -> dict[str, int]:
-        """Whole microseconds of each step, the same part for each batch."""
+        """The time of each step in whole microseconds, divided equally among the batches."""
         return {step: ns // 1000 // self._batches for step, ns in self.ns.items()}
 
 
 class Search(Struct, frozen=True, eq=False):
-    """The conditions of every search for the stars of one batch, all of them or a part."""
+    """The conditions of every search for the stars of one batch, or for a part of them."""
 
     batch: ObservationBatch
     mission: Mission
@@ -92,7 +93,7 @@ class Search(Struct, frozen=True, eq=False):
 
     @property
     def identifier(self) -> IdentifierEntry:
-        """The identifier of the batch."""
+        """The registered identifier of the batch."""
         return IDENTIFIERS[self.choices.identifier]
 
     @property
@@ -102,18 +103,18 @@ class Search(Struct, frozen=True, eq=False):
 
     @property
     def zone_choices(self) -> tuple[float, float]:
-        """The widest pair of a zone, and the grid of its axes."""
+        """The largest pair separation of a zone, and the grid step of zone axes, in degrees."""
         return self.choices.tolerances.pair_separation_max_deg, self.choices.zone_grid_deg
 
     def zone(self, region: SearchRegion) -> tuple[Zone, bool]:
-        """The zone that serves a region, and whether it was cached."""
+        """The zone that serves a search region, and true if it was cached."""
         return self.sky.zone(self.mission, self.run_catalog, region, *self.zone_choices)
 
 
 class ZoneResult(Struct, frozen=True, eq=False):
     """The result of a search in the zones about one presumed attitude.
 
-    `places` are those of the trackers.
+    `places` are the search regions of the trackers.
     """
 
     prior: PriorAttitude
@@ -128,7 +129,7 @@ class ZoneResult(Struct, frozen=True, eq=False):
 
 
 class _Asked(Struct, frozen=True, eq=False):
-    """One row of a `ZoneSearch`: about what to search, and what that may cost."""
+    """The request of one row of a `ZoneSearch`: prior, search regions, and work limit."""
 
     search: Search
     prior: PriorAttitude
@@ -138,7 +139,7 @@ class _Asked(Struct, frozen=True, eq=False):
 
 
 class ZoneSearch:
-    """Searches for the stars of batches, each about a presumed attitude of its own.
+    """Searches for the stars of many batches, each about its own presumed attitude.
 
     | column | shape | |
     |---|---|---|
@@ -149,8 +150,8 @@ class ZoneSearch:
     | `cached` | (t,) | whether the zone was in the cache |
     | `within` | (t, 2) | stars and pairs within the region searched |
 
-    `add` says what to search for a row, `run` searches, and then `errors` has what kept a row
-    from a result, by row.
+    `add` defines the search of a row, `run` searches, and then `errors` has, by row, the errors
+    that prevented a result.
     """
 
     def __init__(self, stars: CorrectedColumns) -> None:
@@ -163,10 +164,11 @@ class ZoneSearch:
         self.errors: dict[int, Exception] = {}
         self._asked: dict[int, _Asked] = {}
         self._by_itself: dict[int, Identification] = {}
-        """By tracker, the results of identifiers that take one sighting at a time."""
+        """The results, by tracker, of identifiers that take one sighting at a time."""
         self._zones: dict[tuple[int, *tuple[Hashable, ...]], list[tuple[int, int]]] = {}
-        """(row, tracker) that are identified in one call, by (place of the tracker in its batch,
-        identifier, rules, zone)."""
+        """Lists of (row, tracker) that are identified in one call, by (index of the tracker in its
+        batch, identifier, rules, zone).
+        """
 
     def __contains__(self, row: int) -> bool:
         return row in self._asked
@@ -179,11 +181,11 @@ class ZoneSearch:
         budget: WorkBudget | None = None,
         regions: Sequence[SearchRegion] | None = None,
     ) -> None:
-        """Search for the stars of a row about a presumed attitude, within this budget.
+        """Add a search for a row's stars about a presumed attitude, with a work limit.
 
-        By default within three quarters of the batch's: the rest is for the whole sky, and for
-        the stars that the answer leaves.  `regions` are those of the trackers where not the
-        prior's.  Raises `BadBatch` as `search_region` does.
+        The default limit is three quarters of the batch's; the rest is for the whole sky, and for
+        stars left unexplained. `regions` replace the trackers' regions derived from the prior.
+        Raises `BadBatch` as `search_region` does.
         """
         stars, seen, rows = self.stars, self.seen, self.stars.trackers_of(row)
         trackers = [each for each in stars.trackers[rows.start : rows.stop] if each is not None]
@@ -198,7 +200,7 @@ class ZoneSearch:
         for index, (t, region, tracker) in enumerate(zip(rows, regions, trackers, strict=True)):
             first, last = offsets[index : index + 2]
             seen.direction[first:last] = np.dot(stars.direction_body[first:last], prior.attitude)
-            # A cap is searched about the boresight itself.
+            # A cap is centred on the boresight itself.
             is_cap = region.kind == "cap"
             seen.boresight[t] = (
                 region.axis if is_cap else np.dot(tracker.boresight_body, prior.attitude)
@@ -208,14 +210,14 @@ class ZoneSearch:
             seen.prior_axis[t] = region.axis if known is None else known
             seen.set_region(t, region)
             zone = zone_key(search.mission.name, search.run_catalog, region, *search.zone_choices)
-            # Trackers of one batch share its budget, one after the other.
+            # Trackers of one batch use its budget one after another.
             key = index, search.choices.identifier, *same_rules, zone
             self._zones.setdefault(key, []).append((row, t))
         budget = budget or search.budget.share(3, 4)
         self._asked[row] = _Asked(search, prior, trackers, regions, budget)
 
     def run(self, timer: StepTimer) -> None:
-        """Identify the stars, zone by zone, and solve for the attitudes."""
+        """Identify the stars zone by zone, and solve for the attitudes."""
         for (index, *_), sightings in sorted(self._zones.items(), key=lambda each: each[0][0]):
             sightings = [each for each in sightings if each[0] not in self.errors]
             if not sightings:
@@ -224,19 +226,19 @@ class ZoneSearch:
             try:
                 zone, cached = first.search.zone(first.regions[index])
             except Exception as error:
-                # The batches of this zone fail; those of other zones go on.
+                # The batches of this zone fail; those of other zones continue.
                 self.errors |= dict.fromkeys((row for row, _ in sightings), as_row_error(error))
                 continue
             timer.end("zone")
             self._identify(zone, index, sightings)
-            # For the others it was there.
+            # For the others the zone was in the cache.
             self.cached[sightings[0][1]] = cached
             timer.end("identify")
         self._solve()
         timer.end("solve")
 
     def _identify(self, zone: Zone, index: int, sightings: list[tuple[int, int]]) -> None:
-        """Identify the stars of those trackers (row, tracker) that a zone serves."""
+        """Identify the stars of the trackers, given as (row, tracker), that a zone serves."""
         seen, offsets = self.seen, self.stars.star_offsets
         first = self._asked[sightings[0][0]].search
         identifier, rules = first.identifier, first.choices.rules
@@ -256,7 +258,7 @@ class ZoneSearch:
                     alone = identifier.identify(self._sighting(t, asked, index, zone, budget))
                     self._by_itself[t], self.found.star[stars] = alone, alone.star
             except Exception as error:
-                # This batch fails; the others of the zone go on.
+                # This batch fails; the others of the zone continue.
                 self.errors[row] = as_row_error(error)
         count_within(zone, which, seen.axis, seen.least, seen.most, self.within)
         if budgets:
@@ -269,7 +271,7 @@ class ZoneSearch:
     def _sighting(
         self, t: int, asked: _Asked, index: int, zone: Zone, budget: WorkBudget
     ) -> Sighting:
-        """The input of an identifier that takes one sighting at a time."""
+        """The input for an identifier that takes one sighting at a time."""
         seen, search, guide = self.seen, asked.search, None
         first, last = seen.offsets[t : t + 2]
         if search.identifier.needs_guide:
@@ -291,7 +293,7 @@ class ZoneSearch:
         )
 
     def _solve(self) -> None:
-        """The attitudes, of all that have the same catalog, day and solver in one call."""
+        """Solve all attitudes, in one call for each combination of catalog, day and solver."""
         together: dict[Hashable, tuple[Vector, SolverName, list[int]]] = {}
         n = len(self.stars.tracker_offsets) - 1
         velocity_c, sun_au = np.empty((n, 3)), np.empty(n)
@@ -313,11 +315,11 @@ class ZoneSearch:
     # ---- results -----------------------------------------------------------------------------
 
     def final_rows(self) -> list[int]:
-        """The rows of batches that need no other search.
+        """The rows of batches that need no further search.
 
-        They have a good attitude, or an identifier that never searches the whole sky instead, and
-        too few stars left for a second group.  A batch with a prediction is never among them:
-        its attitude may contradict the prediction.
+        They have a good attitude, or an identifier that never searches the whole sky, and too few
+        stars left for a second group. A batch with a prediction is never final here, since its
+        attitude may contradict the prediction.
         """
         offsets, trackers = self.stars.star_offsets.tolist(), self.stars.tracker_offsets.tolist()
         explained, final = self.found.explained.tolist(), []
@@ -333,7 +335,7 @@ class ZoneSearch:
         return final
 
     def result(self, row: int) -> ZoneResult:
-        """The stars and the attitude that the search found for a row."""
+        """The result of the search for a row: identified stars and attitude."""
         asked, stars, trackers = self._asked[row], self.stars, self.stars.trackers_of(row)
         search = asked.search
         offsets = stars.star_offsets[trackers.start : trackers.stop + 1].tolist()

@@ -1,1 +1,1 @@
-"""Attitude determination: TRIAD and QUEST from matched vectors, with covariance."""
+"""Attitude determination from matched vectors by TRIAD and QUEST, with covariance."""

@@ -1,6 +1,6 @@
-"""Covariances, their inverses and Cholesky factors, and products of small matrices, compiled.
+"""Compiled functions for small matrices: covariances, inverses, Cholesky factors, products.
 
-Nothing is allocated.
+They allocate nothing.
 """
 
 import math
@@ -10,9 +10,9 @@ from service.compiled.jit import njit_no_refcount
 
 @njit_no_refcount
 def within(p, largest):  # type: ignore[no-untyped-def]
-    """True if no axis of a covariance (3, 3) has more than the largest variance allowed.
+    """True if no axis of a covariance (3, 3) has more than the largest allowed variance.
 
-    That is where I - P / largest is positive definite.
+    The condition is that I - P / largest is positive definite.
     """
     a, b, c = 1.0 - p[0, 0] / largest, 1.0 - p[1, 1] / largest, 1.0 - p[2, 2] / largest
     d, e, f = p[0, 1] / largest, p[0, 2] / largest, p[1, 2] / largest
@@ -23,7 +23,7 @@ def within(p, largest):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def information(vectors, weights, matrix):  # type: ignore[no-untyped-def]
-    """Sum of sigma^-2 (I - v v^T): the inverse of the covariance, in rad^-2."""
+    """The information matrix of unit vectors, sum of sigma^-2 (I - v v^T), in rad^-2."""
     m00 = m01 = m02 = m11 = m12 = m22 = 0.0
     for k in range(len(weights)):
         w, v0, v1, v2 = weights[k], vectors[k, 0], vectors[k, 1], vectors[k, 2]
@@ -41,7 +41,7 @@ def information(vectors, weights, matrix):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def inverse_symmetric(m, out):  # type: ignore[no-untyped-def]
-    """The inverse of a symmetric (3, 3); False where it has none."""
+    """Write the inverse of a symmetric matrix (3, 3) into `out`; false if it is singular."""
     c00 = m[1, 1] * m[2, 2] - m[1, 2] * m[1, 2]
     c01 = m[0, 2] * m[1, 2] - m[0, 1] * m[2, 2]
     c02 = m[0, 1] * m[1, 2] - m[0, 2] * m[1, 1]
@@ -60,7 +60,7 @@ def inverse_symmetric(m, out):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def multiply(a, b, out):  # type: ignore[no-untyped-def]
-    """A B into `out`, which is neither of them."""
+    """Write the matrix product A B into `out`, which must be neither of the two."""
     for i in range(a.shape[0]):
         for j in range(b.shape[1]):
             total = 0.0
@@ -71,7 +71,7 @@ def multiply(a, b, out):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def multiply_transposed(a, b, out):  # type: ignore[no-untyped-def]
-    """A B^T into `out`, which is neither of them."""
+    """Write the matrix product A B^T into `out`, which must be neither of the two."""
     for i in range(a.shape[0]):
         for j in range(b.shape[0]):
             total = 0.0
@@ -82,7 +82,7 @@ def multiply_transposed(a, b, out):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def congruence(a, p, out, scratch):  # type: ignore[no-untyped-def]
-    """A P A^T into `out`, exactly symmetric; P is symmetric and may be `out`."""
+    """Write A P A^T into `out`, exactly symmetric, for a symmetric P, which may be `out`."""
     multiply(a, p, scratch)
     for i in range(a.shape[0]):
         for j in range(i + 1):
@@ -94,7 +94,7 @@ def congruence(a, p, out, scratch):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def copy(a, out):  # type: ignore[no-untyped-def]
-    """A into `out`."""
+    """Copy the matrix A into `out`."""
     for i in range(a.shape[0]):
         for j in range(a.shape[1]):
             out[i, j] = a[i, j]
@@ -102,7 +102,7 @@ def copy(a, out):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def cholesky(m, size, lower):  # type: ignore[no-untyped-def]
-    """The factor L of the first `size` rows and columns, m = L L^T; False where there is none."""
+    """Cholesky factor L of the first `size` rows and columns, m = L L^T; false if not definite."""
     for i in range(size):
         for j in range(i + 1):
             total = m[i, j]
@@ -119,7 +119,7 @@ def cholesky(m, size, lower):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def solve_factored(lower, size, x):  # type: ignore[no-untyped-def]
-    """Replace x by m^-1 x, of the factor of m."""
+    """Solve m x = b in place for x, given the Cholesky factor of m."""
     for i in range(size):
         for k in range(i):
             x[i] -= lower[i, k] * x[k]

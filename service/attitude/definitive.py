@@ -25,7 +25,7 @@ GRADES: tuple[Grade, ...] = ("filtered", "smoothed")
 
 
 class Status(IntEnum):
-    """What an attitude is worth.
+    """The quality of an attitude in the history.
 
     NONE: no attitude was measured yet.  STARTING: started, and not yet confirmed by
     further measurements.  GOOD.  DOUBTFUL: the last measurements contradict the
@@ -40,10 +40,10 @@ class Status(IntEnum):
 
 
 class Outcome(IntEnum):
-    """What became of a measurement.
+    """The outcome of a measured attitude in the filter.
 
-    UNUSED: a direction where there was no attitude.  UNDECIDED: it agrees with the attitude
-    and with the one that contradicted it, and was not used either.
+    UNUSED: a direction measured before there was an attitude. UNDECIDED: the measurement agrees
+    both with the attitude and with another that contradicted it, and was not used.
     """
 
     UNUSED = 0
@@ -55,7 +55,7 @@ class Outcome(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class TimedColumns:
-    """Columns of equal length, the first of which are times."""
+    """Columns of equal length, beginning with times."""
 
     tai_ns: Integers
 
@@ -63,26 +63,26 @@ class TimedColumns:
         return len(self.tai_ns)
 
     def taken(self, places: Any) -> Self:
-        """The rows at some places."""
+        """The rows of the columns at given indices."""
         return type(self)(**{each.name: getattr(self, each.name)[places] for each in fields(self)})
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
-        """The rows of parts, one after the other."""
+        """The columns of several parts, concatenated."""
         columns = (each.name for each in fields(cls))
         return cls(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in columns})
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredInnovations(TimedColumns):
-    """The innovations of m measured attitudes, in order of time; equal times are allowed.
+    """The innovations of m measured attitudes in order of time; equal times are allowed.
 
-    `tai_ns` (m,) and `outcome` (m,), an `Outcome`.  About the body axes in
-    arcsec: `innovation_arcsec` (m, 3) with its covariance `predicted_arcsec2` (m, 6), the upper
-    triangle 11, 12, 13, 22, 23, 33, and `nis` (m,) z^T S^-1 z of three degrees of freedom, which
-    are NaN of a measurement that met no prediction; `measured_arcsec2` (m, 6) of the
-    measurement alone; `difference_arcsec` (m, 3) from the smoothed attitude to the
-    measurement, and one sigma of it (m, 3).
+    `tai_ns` (m,) and `outcome` (m,), an `Outcome`. About the body axes in arcsec:
+    `innovation_arcsec` (m, 3) with its covariance `predicted_arcsec2` (m, 6), the upper triangle
+    11, 12, 13, 22, 23, 33, and `nis` (m,) z^T S^-1 z of three degrees of freedom, which are NaN for
+    a measurement without a prediction; `measured_arcsec2` (m, 6) is the covariance of the
+    measurement alone; `difference_arcsec` (m, 3) from the smoothed attitude to the measurement, and
+    one sigma of that difference (m, 3).
     """
 
     outcome: Integers
@@ -95,29 +95,31 @@ class MeasuredInnovations(TimedColumns):
 
     @property
     def is_used(self) -> npt.NDArray[np.bool_]:
-        """The measurements (m,) that the filter took: it was accepted, or began with it."""
+        """True for measurements (m,) that the filter used: accepted, or used for a start."""
         return was_used(self.outcome)
 
     @property
     def innovation_sigma_arcsec(self) -> Vector:
-        """One sigma (m, 3) of each component of the innovation."""
+        """One sigma (m, 3) of each component of the innovations, in arcsec."""
         return np.asarray(np.sqrt(self.predicted_arcsec2[:, [0, 3, 5]]))
 
 
 def was_used(outcome: Integers) -> npt.NDArray[np.bool_]:
-    """Marks (m,) of the measurements that the filter took: accepted, or it began with it."""
+    """True for outcomes (m,) of measurements that the filter used: accepted, or used for a
+    start.
+    """
     return np.asarray((outcome == Outcome.ACCEPTED) | (outcome == Outcome.STARTED))
 
 
 @dataclass(frozen=True, eq=False)
 class DefinitiveSamples(TimedColumns):
-    """Attitudes of a stretch of one grade.
+    """Attitude samples of one continuous interval and one kind (filtered or smoothed).
 
     `tai_ns` (n,), `quaternion` (n, 4) inertial to body, `covariance_arcsec2` (n, 6) of the small
-    error rotation about the body axes (11, 12, 13, 22, 23, 33), `rate_deg_per_s` (n, 3) of the
-    body in the step that ends at the sample, `bias_deg_per_h` (n, 3) of the gyro and
-    `bias_sigma_deg_per_h` (n, 3); `status` (n,) is a `Status`.  At a constant
-    rate there is no bias, and the sigma is that of the rate.
+    error rotation about the body axes (11, 12, 13, 22, 23, 33), `rate_deg_per_s` (n, 3) of the body
+    in the step that ends at the sample, `bias_deg_per_h` (n, 3) of the gyro and
+    `bias_sigma_deg_per_h` (n, 3); `status` (n,) is a `Status`. Without a gyro, for the
+    constant-rate model, there is no bias, and the sigma is that of the rate.
     """
 
     quaternion: Vector
@@ -129,22 +131,21 @@ class DefinitiveSamples(TimedColumns):
 
 
 def day_bounds(day: int) -> tuple[Utc, Utc]:
-    """The beginning of a UTC day, counted as `Utc.bucket`, and of the next."""
+    """The beginning of a UTC day, numbered as `Utc.bucket`, and of the next day."""
     return bucket_start(day, DAY_S), bucket_start(day + 1, DAY_S)
 
 
-# Samples and innovations as compressed bytes, and back.
-#
-# Times and quaternions keep every bit, all else has the seven digits of a float32.  The bytes of
-# equal weight stand together, so that signs and exponents, which hardly change, take no room.
+# Compression of samples and innovations to bytes, and back. Times and quaternions keep every bit,
+# other values the seven digits of a float32. Bytes of equal weight are stored together, so that
+# signs and exponents, which hardly change, take little room.
 
 Packable = TypeVar("Packable", DefinitiveSamples, MeasuredInnovations)
 Fields = tuple[tuple[str, str, int], ...]
 
 LEVEL = 1
-"""The level of zlib; level 6 takes five times as long for about 3 % less."""
+"""Compression level of zlib; level 6 takes five times as long for about 3 % less."""
 MOST_PACKED = 3_600
-"""The most samples of a block: an hour."""
+"""Largest number of samples in a compressed block: an hour."""
 _FIELDS: dict[type, Fields] = {
     DefinitiveSamples: (
         ("tai_ns", "<i8", 1),
@@ -166,17 +167,17 @@ _FIELDS: dict[type, Fields] = {
         ("difference_sigma_arcsec", "<f4", 3),
     ),
 }
-"""Name, type and columns of each field; the times come first."""
+"""Name, type and number of columns of each stored field, the times first."""
 _NUMBERS = {"i": np.int64, "u": np.int64, "f": np.float64}
 
 
 def packed(samples: DefinitiveSamples | MeasuredInnovations) -> bytes:
-    """The compressed bytes of samples."""
+    """Samples or innovations as compressed bytes."""
     parts = []
     for name, kind, _ in _FIELDS[type(samples)]:
         values = np.asarray(getattr(samples, name)).T
         if kind == "<i8":
-            # Steps are alike, times are not.
+            # Time steps are similar, times are not.
             values = np.diff(values, prepend=0)
         each = np.ascontiguousarray(values, kind)
         parts.append(each.view(np.uint8).reshape(-1, each.itemsize).T.tobytes())
@@ -192,7 +193,7 @@ def unpacked(data: bytes, samples: int) -> DefinitiveSamples:
 
 
 def unpacked_innovations(data: bytes, measurements: int) -> MeasuredInnovations:
-    """Unpack `measurements` measurements; raises `ValueError` as `unpacked`."""
+    """Unpack `measurements` innovations from bytes; raises `ValueError` as `unpacked` does."""
     return _unpacked(MeasuredInnovations, data, measurements)
 
 

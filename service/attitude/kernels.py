@@ -1,4 +1,4 @@
-"""The attitude of matched vectors by TRIAD and by QUEST, with residuals, compiled.
+"""Compiled attitude solutions from matched vectors by TRIAD and QUEST, with residuals.
 
 b are observed unit vectors in body axes, r the reference vectors in inertial
 axes, weights are sigma^-2 with sigma in radians.  Quaternions are scalar last,
@@ -24,19 +24,21 @@ from service.compiled.jit import njit, njit_no_refcount
 from service.vectors import ARCSEC_PER_RADIAN, Matrix, Vector
 
 TRIAD, QUEST, START = 0, 1, 2
-"""Rows of the quaternions: the two methods, and the rough attitude that QUEST starts from."""
+"""Rows of a fit's quaternions: the two methods, and the rough start of QUEST."""
 PLAIN, WEIGHTED, EXPECTED = 0, 1, 2
-"""Columns of the sums of squared residuals: as they are, by weight, and as predicted."""
+"""Columns of the sums of squared residuals: unweighted, weighted, and predicted."""
 RMS, PREDICTED_RMS, TASTE, APART = 0, 1, 2, 3
-"""The figures: rms residual and its prediction, TASTE, and the angle between both methods."""
+"""Indices of a fit's figures: rms residual, its prediction, TASTE, and the methods' difference
+angle.
+"""
 
 
 class FitWorkspace(NamedTuple):
-    """What `fit_attitude` writes for n vectors, angles in arcsec.
+    """The output arrays of `fit_attitude` for n vectors, angles in arcsec.
 
-    `quaternions` (3, 4) are those of TRIAD and QUEST, and the start of QUEST.  Of the
-    chosen method: `attitude` (3, 3), `covariance_arcsec2` (3, 3), `residual_arcsec`
-    (n,), and among the `figures` (4,) the rms residual and its prediction.
+    `quaternions` (3, 4) are those of TRIAD and QUEST, and the start of QUEST. The chosen method
+    gives `attitude` (3, 3), `covariance_arcsec2` (3, 3), `residual_arcsec` (n,), and among the
+    `figures` (4,) the rms residual and its prediction.
     """
 
     quaternions: Any
@@ -59,14 +61,13 @@ def solve(
     sums: Vector,
     scratch: Vector,
 ) -> bool:
-    """TRIAD into row 0 of `quaternions` (3, 4), QUEST into row 1.
+    """Solve Wahba's problem by TRIAD into row 0 of `quaternions` (3, 4), and by QUEST into row 1.
 
-    `covariance` (3, 3) gets that of the method in row `chosen`, in rad^2.
-    `squares` (2, n) gets the squared residuals |b - A r|^2 of either, `sums`
-    (2, 3) their sum, their sum in units of sigma^2 and, in row `chosen`, what the
-    first is expected to be.  False where the geometry leaves the chosen
-    attitude an axis worse than `worst_rad`.  Row 2 of `quaternions` gets the
-    start of QUEST; `scratch` (3, 3, 3) is written to.
+    `covariance` (3, 3) is set for the method in row `chosen`, in rad^2. `squares` (2, n) gets the
+    squared residuals |b - A r|^2 of both, `sums` (2, 3) their sum, their sum in units of sigma^2
+    and, in row `chosen`, the expected value of the first. Returns false if the geometry leaves the
+    chosen attitude an axis worse than `worst_rad`. Row 2 of `quaternions` gets the start of QUEST;
+    `scratch` (3, 3, 3) is written to.
     """
     n = len(b)
     first, second, sine = widest_pair(b, r, weights)
@@ -76,7 +77,7 @@ def solve(
     information(b, weights, matrix)
     if not inverse_symmetric(matrix, covariance):
         return False
-    # Every axis is better than the bound where M - I / worst^2 is positive definite.
+    # Every axis is better than the bound if M - I / worst^2 is positive definite.
     least = 1.0 / (worst_rad * worst_rad)
     m00, m11, m22 = matrix[0, 0] - least, matrix[1, 1] - least, matrix[2, 2] - least
     minor = m00 * m11 - matrix[0, 1] * matrix[0, 1]
@@ -95,7 +96,7 @@ def solve(
             return False
     triad(b[first], b[second], r[first], r[second], attitude)
     to_quaternion(attitude, quaternions[TRIAD])
-    # The widest pair may be of coarse stars; TRIAD of the firmest is near the optimum.
+    # The widest pair may have large sigmas; TRIAD of the most accurate pair is near the optimum.
     start = quaternions[START]
     anchor, other = firmest_pair(b, r, weights)
     if anchor == other:
@@ -125,12 +126,12 @@ def solve(
 
 @njit_no_refcount
 def _expected_square(b, weights, p, chosen, first, second):  # type: ignore[no-untyped-def]
-    """The expectation of the sum of squared residuals at an attitude of covariance `p`.
+    """The expected sum of squared residuals for an attitude with covariance `p`.
 
-    A residual is the star's own noise and, across the star, the attitude's
-    error.  QUEST's error takes as much from the sum as it would add to that of
-    a star that it was not solved from.  TRIAD leaves its pair the difference
-    between the separations observed and referred to, and others both parts.
+    A residual is the star's own noise and, across the star, the attitude's error. QUEST's error
+    reduces the sum by as much as it would increase it for independent stars. With TRIAD the
+    residual of its pair is the difference between the observed and the reference separation, and
+    other stars have both parts.
     """
     trace = p[0, 0] + p[1, 1] + p[2, 2]
     total = 0.0
@@ -149,11 +150,11 @@ def _expected_square(b, weights, p, chosen, first, second):  # type: ignore[no-u
 
 @njit(error_model="numpy")
 def fit_attitude(b, r, sigma_rad, worst_rad, chosen, workspace):  # type: ignore[no-untyped-def]
-    """All that `solve` gives, in one call and in the units that are shown; whether there is any.
+    """Fit an attitude to matched vectors, with figures in display units; false if there is none.
 
-    `chosen` is the row of the method whose attitude, covariance and residuals go to
-    the workspace.  TASTE is QUEST's whichever that is: at the optimal attitude alone
-    the weighted sum of squares is chi-square with 2 n - 3 degrees of freedom.
+    `chosen` is the row of the method whose attitude, covariance and residuals go to the workspace.
+    TASTE is always QUEST's: only at the optimal attitude is the weighted sum of squares chi-square
+    with 2 n - 3 degrees of freedom.
     """
     n = len(b)
     weights, squares, sums = np.empty(n), np.empty((2, n)), np.empty((2, 3))

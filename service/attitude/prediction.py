@@ -1,4 +1,4 @@
-"""From one attitude to a later one: by gyro samples, or at a rate that is believed constant.
+"""Prediction of an attitude to a later time, by gyro samples or at a constant rate.
 
 A rotation vector theta turns an attitude as in `attitude.quaternions`: A' = exp(-[theta x]) A.
 The rate of a body without a gyro is a random walk of density q (rad/s^1.5), so that after t
@@ -25,7 +25,7 @@ NS = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """An attitude (4,), inertial to body, at a time (`Utc.tai_ns`), with its covariance (3, 3)."""
+    """Known attitude: quaternion (4,) inertial to body, time (`Utc.tai_ns`), covariance (3, 3)."""
 
     tai_ns: int
     quaternion: Vector
@@ -34,10 +34,10 @@ class Known:
 
 @dataclass(frozen=True, eq=False)
 class Rate:
-    """The mean rate (3,) about the body axes from an attitude on, in rad/s.
+    """The mean rate (3,) about the body axes after a known attitude, in rad/s, with its errors.
 
-    `variance` are its errors' about each axis (3, 3) in (rad/s)^2, and `walk_s3` the share of
-    q^2 in the variance of the angle, in s^3.
+    `variance` (3, 3) is its covariance in (rad/s)^2, and `walk_s3` the factor of q^2 in the
+    variance of the angle, in s^3.
     """
 
     rad_s: Vector
@@ -46,16 +46,16 @@ class Rate:
 
 
 def given_rate(rates_rad_s: list[Vector], sigma_rad_s: float, passed_s: float) -> Rate:
-    """The mean of the rates that one or both batches carry, both where there are two."""
+    """The mean rate from the rates sent with the earlier and later batch, one or both."""
     share = 12.0 if len(rates_rad_s) > 1 else 3.0
     variance = np.eye(3) * sigma_rad_s**2
     return Rate(np.mean(rates_rad_s, axis=0), variance, passed_s**3 / share)
 
 
 def derived_rate(before: Known, known: Known, passed_s: float) -> Rate:
-    """The mean rate between two attitudes, for the time after the second.
+    """The mean rate between two attitudes, used after the second.
 
-    A rate that walks at random is off its mean over h seconds by q^2 h / 3 at their end.
+    A random-walk rate differs from its mean over h seconds by a variance of q^2 h / 3 at the end.
     """
     h = (known.tai_ns - before.tai_ns) * NS
     was, now = (matrix_from_quaternion(each.quaternion) for each in (before, known))
@@ -65,12 +65,12 @@ def derived_rate(before: Known, known: Known, passed_s: float) -> Rate:
 
 
 def unknown_rate(sigma_rad_s: float, passed_s: float) -> Rate:
-    """No rotation, of which nothing is known but how fast the body may turn."""
+    """A zero rate with the uncertainty of how fast the body may rotate."""
     return Rate(np.zeros(3), np.eye(3) * sigma_rad_s**2, passed_s**3 / 3.0)
 
 
 def predict_at_rate(known: Known, tai_ns: int, rate: Rate, walk_rad_s1_5: float) -> Known:
-    """The attitude at a later time, at a constant rate but for its random walk."""
+    """The attitude predicted to a later time at a constant rate with a random walk."""
     passed_s = (tai_ns - known.tai_ns) * NS
     turn = _quaternions(rate.rad_s[None] * passed_s)[0]
     added = rate.variance * passed_s**2 + np.eye(3) * walk_rad_s1_5**2 * rate.walk_s3
@@ -80,9 +80,9 @@ def predict_at_rate(known: Known, tai_ns: int, rate: Rate, walk_rad_s1_5: float)
 def predict_by_gyro(
     known: Known, tai_ns: int, model: GyroModel, samples: GyroSamples, walk_rad_s1_5: float
 ) -> Known | None:
-    """The attitude at a later time by gyro samples, or None where they do not reach so far.
+    """The attitude predicted to a later time by gyro samples; None if they do not reach that time.
 
-    The last sample may be a step old.  The bias is believed to be zero, with the model's sigma.
+    The last sample may be one step old. The bias is assumed zero, with the model's sigma.
     """
     times_ns, rates = samples.tai_ns, samples.rate_rad_s
     if len(times_ns) < 2:
@@ -113,26 +113,28 @@ def predict_by_gyro(
 
 
 def _turned(known: Known, tai_ns: int, turn: Vector, added_rad2: Matrix) -> Known:
-    """After a rotation, given as a quaternion; its covariance is about the axes after it."""
+    """A known attitude after a rotation, given as a quaternion, with covariance about the new
+    axes.
+    """
     quaternion = _compose(turn[None], known.quaternion[None])[0]
     if quaternion[3] < 0.0:
         quaternion = -quaternion
     rotation = matrix_from_quaternion(turn)
     covariance = rotation @ known.covariance_rad2 @ rotation.T + added_rad2
-    # Rounding must not leave it unsymmetric.
+    # Rounding must not make it asymmetric.
     covariance = 0.5 * (covariance + covariance.T)
     return Known(tai_ns, quaternion / np.linalg.norm(quaternion), covariance)
 
 
 def _quaternions(rotation_vectors_rad: Vector) -> Vector:
-    """The quaternions (n, 4) of exp(-[theta x]) for rotation vectors (n, 3)."""
+    """The quaternions (n, 4) of the rotations exp(-[theta x]) for rotation vectors theta (n, 3)."""
     half = 0.5 * np.linalg.norm(rotation_vectors_rad, axis=1, keepdims=True)
     vector = 0.5 * np.sinc(half / np.pi) * rotation_vectors_rad
     return np.hstack([vector, np.cos(half)])
 
 
 def _compose(after: Vector, before: Vector) -> Vector:
-    """The quaternions (n, 4) of A(after) A(before)."""
+    """The quaternions (n, 4) of the products A(after) A(before)."""
     a, b = after[:, :3], before[:, :3]
     ac, bc = after[:, 3:], before[:, 3:]
     vector = ac * b + bc * a - np.cross(a, b)
@@ -140,7 +142,7 @@ def _compose(after: Vector, before: Vector) -> Vector:
 
 
 def _product(quaternions: Vector) -> Vector:
-    """The quaternion (4,) of A(last) ... A(first), in pairs: a loop would take long."""
+    """Quaternion (4,) of A(last) ... A(first), multiplied in pairs, since a loop would be slow."""
     while len(quaternions) > 1:
         odd = quaternions[-1:] if len(quaternions) % 2 else quaternions[:0]
         even = len(quaternions) - len(odd)

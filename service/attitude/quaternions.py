@@ -1,4 +1,4 @@
-"""Quaternions, attitude matrices and small rotations, compiled; scalar last, inertial to body.
+"""Compiled functions for quaternions (scalar last, inertial to body), matrices, small rotations.
 
 theta is a rotation vector about the body axes, in radians, such as the error of an attitude:
 A_true = A(theta) A, where A(theta) = exp(-[theta x]).
@@ -11,7 +11,7 @@ from service.compiled.jit import njit_no_refcount
 
 @njit_no_refcount
 def to_matrix(q, a):  # type: ignore[no-untyped-def]
-    """A(q) into a (3, 3)."""
+    """Write the attitude matrix A(q) of a quaternion into `a` (3, 3)."""
     q1, q2, q3, qc = q[0], q[1], q[2], q[3]
     a[0, 0] = q1 * q1 - q2 * q2 - q3 * q3 + qc * qc
     a[0, 1] = 2 * (q1 * q2 + q3 * qc)
@@ -26,7 +26,7 @@ def to_matrix(q, a):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def to_quaternion(a, q):  # type: ignore[no-untyped-def]
-    """The quaternion of an attitude matrix, qc >= 0, by Shepperd's largest component."""
+    """Write the quaternion of an attitude matrix into `q`, qc >= 0, by Shepperd's method."""
     trace = a[0, 0] + a[1, 1] + a[2, 2]
     if trace >= a[0, 0] and trace >= a[1, 1] and trace >= a[2, 2]:
         q[0], q[1], q[2] = a[1, 2] - a[2, 1], a[2, 0] - a[0, 2], a[0, 1] - a[1, 0]
@@ -45,7 +45,7 @@ def to_quaternion(a, q):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def normalise(q):  # type: ignore[no-untyped-def]
-    """Scale a quaternion to norm one, with qc >= 0."""
+    """Scale a quaternion to norm one in place, with qc >= 0."""
     norm = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     if q[3] < 0.0:
         norm = -norm
@@ -55,7 +55,7 @@ def normalise(q):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def turn(q, theta, out):  # type: ignore[no-untyped-def]
-    """The quaternion of A(theta) A(q) into `out` (4,), which may be q."""
+    """Write the quaternion of A(theta) A(q) into `out` (4,), which may be q."""
     angle = math.sqrt(theta[0] * theta[0] + theta[1] * theta[1] + theta[2] * theta[2])
     half = 0.5 * angle
     scale = 0.5 if half < 1e-9 else math.sin(half) / angle
@@ -70,7 +70,7 @@ def turn(q, theta, out):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def rotation_between(q, to, theta):  # type: ignore[no-untyped-def]
-    """The rotation vector theta (3,) with A(to) = A(theta) A(q), of at most half a turn."""
+    """Write the rotation vector theta (3,) with A(to) = A(theta) A(q), at most half a turn."""
     c = q[3] * to[3] + q[0] * to[0] + q[1] * to[1] + q[2] * to[2]
     theta[0] = q[3] * to[0] - to[3] * q[0] + (to[1] * q[2] - to[2] * q[1])
     theta[1] = q[3] * to[1] - to[3] * q[1] + (to[2] * q[0] - to[0] * q[2])

@@ -1,4 +1,4 @@
-"""QUEST, polished by Gauss-Newton steps, compiled.
+"""The QUEST method, compiled, with final Gauss-Newton steps.
 
 b are observed unit vectors in body axes, r the reference vectors in inertial
 axes, weights are sigma^-2 with sigma in radians.
@@ -14,14 +14,14 @@ POLISHING_STEPS = 10
 
 @njit_no_refcount
 def quest(b, r, weights, start, q, scratch):  # type: ignore[no-untyped-def]
-    """Wahba's attitude by QUEST (Shuster & Oh 1981) into q; `scratch` (3, 3, 3) is written to.
+    """Solve Wahba's problem by QUEST (Shuster & Oh 1981) into `q`; `scratch` (3, 3, 3) is work
+    space.
 
-    `start` is a rough quaternion: its largest component tells by which half
-    turn to rotate the reference vectors first, so that the scalar part of what
-    is solved for is never small.  Without it every exact half turn fails.  The
-    characteristic polynomial loses its digits where the field is narrow or the
-    weights are far apart: then the start stands in for its root.  Gauss-Newton
-    steps on the residuals polish the answer.
+    `start` is an approximate quaternion: its largest component selects a half turn by which the
+    reference vectors are rotated first, so that the scalar part of the solved quaternion is never
+    small. Otherwise exact half turns would fail. For a narrow field or very different weights the
+    characteristic polynomial is ill-conditioned: then the start replaces the solution from its
+    root. Gauss-Newton steps on the residuals refine the result.
     """
     turn = 3
     for i in range(3):
@@ -30,7 +30,7 @@ def quest(b, r, weights, start, q, scratch):  # type: ignore[no-untyped-def]
     total = 0.0
     for k in range(len(weights)):
         total += weights[k]
-    # B = sum of a b r^T, number by number: sums in arrays would wait for memory.
+    # B = sum of a b r^T, in scalars: sums in arrays would wait for memory.
     b00 = b01 = b02 = b10 = b11 = b12 = b20 = b21 = b22 = 0.0
     sign0 = 1.0 if turn == 3 or turn == 0 else -1.0
     sign1 = 1.0 if turn == 3 or turn == 1 else -1.0
@@ -91,7 +91,7 @@ def quest(b, r, weights, start, q, scratch):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def _largest_root(pa, pb, pc, pd, sigma):  # type: ignore[no-untyped-def]
-    """The largest root of QUEST's characteristic polynomial, by Newton's steps from 1."""
+    """The largest root of QUEST's characteristic polynomial, by Newton steps from 1."""
     largest = 1.0
     for _ in range(NEWTON_STEPS):
         square = largest * largest
@@ -108,7 +108,7 @@ def _largest_root(pa, pb, pc, pd, sigma):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def _loss(b, r, weights, q, a):  # type: ignore[no-untyped-def]
-    """Wahba's loss; `a` (3, 3) is written to."""
+    """Wahba's loss function at a quaternion; `a` (3, 3) is work space."""
     to_matrix(q, a)
     total = 0.0
     for k in range(len(weights)):
@@ -129,12 +129,12 @@ def _polish(b, r, weights, q, scratch):  # type: ignore[no-untyped-def]
             p0 = a[0, 0] * r[k, 0] + a[0, 1] * r[k, 1] + a[0, 2] * r[k, 2]
             p1 = a[1, 0] * r[k, 0] + a[1, 1] * r[k, 1] + a[1, 2] * r[k, 2]
             p2 = a[2, 0] * r[k, 0] + a[2, 1] * r[k, 1] + a[2, 2] * r[k, 2]
-            # b x p, written with the residual b - p so that it keeps its digits.
+            # b x p, written with the residual b - p to keep its digits.
             d0, d1, d2 = b[k, 0] - p0, b[k, 1] - p1, b[k, 2] - p2
             g0 += weights[k] * (d1 * p2 - d2 * p1)
             g1 += weights[k] * (d2 * p0 - d0 * p2)
             g2 += weights[k] * (d0 * p1 - d1 * p0)
-            # As in `information`.
+            # The information matrix, as in `information`.
             w = weights[k]
             m00 = m00 + w - w * p0 * p0
             m11 = m11 + w - w * p1 * p1
@@ -161,6 +161,6 @@ def _polish(b, r, weights, q, scratch):  # type: ignore[no-untyped-def]
         q[2] = qc * e2 + q2 + q0 * e1 - q1 * e0
         q[3] = qc - q0 * e0 - q1 * e1 - q2 * e2
         normalise(q)
-        # What is left is smaller by the size of the residuals, as parts of a radian.
+        # The remaining error is smaller by the size of the residuals in radians.
         if square < 1e-24:
             return

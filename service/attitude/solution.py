@@ -1,4 +1,4 @@
-"""Matched vectors to an attitude: TRIAD beside QUEST, and all that tells how far to trust it.
+"""Attitude solutions from matched vectors by TRIAD and QUEST, with measures of their quality.
 
 Quaternions are scalar last, inertial to body; the covariance is of the small
 rotation about the body axes.  TASTE (Shuster) is the weighted sum of squared
@@ -21,29 +21,29 @@ from service.vectors import Matrix, Vector, matrix_from_quaternion
 WORST_AXIS_DEG = 1.0
 WORST_AXIS_RAD = math.radians(WORST_AXIS_DEG)
 SUSPECT_TAIL = 0.001
-"""A true solution's TASTE passes the bound that makes it suspect with this probability."""
+"""Probability that the TASTE of a correct solution exceeds the bound for suspicion."""
 ODDS_OF_TWO = 100.0
 """Least likelihood ratio for which one of two trackers is named as the faulty one."""
 METHODS = ("triad", "quest")
-"""By their rows in the quaternions of a fit."""
+"""The methods in the order of their rows in a fit's quaternions."""
 
 
 class NoAttitude(StrEnum):
-    """Why there is no attitude."""
+    """The reasons for having no attitude."""
 
     FEWER_THAN_TWO_UNIQUE_STARS = "fewer_than_two_unique_stars"
     DEGENERATE_GEOMETRY = "degenerate_geometry"
     FEWER_THAN_THREE_STARS = "fewer_than_three_stars"
-    """Without a prior two stars say nothing."""
+    """Without a prior, two stars are ambiguous."""
     NO_MATCH = "no_match"
-    """No attitude of the whole sky explains three of the stars."""
+    """No attitude in the whole sky explains three of the stars."""
     DOUBTFUL_MATCH = "doubtful_match"
-    """An attitude explains some, but chance or another attitude may as well."""
+    """An attitude explains some stars, but so may chance or another attitude."""
 
 
 @dataclass(frozen=True)
 class TrackerFit:
-    """How one tracker's stars agree with the joint attitude."""
+    """The agreement of one tracker's stars with the joint attitude."""
 
     tracker: str
     stars: int
@@ -52,19 +52,18 @@ class TrackerFit:
 
 
 class AttitudeSolution(Struct, frozen=True, eq=False, gc=False):
-    """An attitude, inertial to body, from N >= 2 matched vectors.
+    """An attitude solution, inertial to body, from N >= 2 matched vectors.
 
-    `quaternion` is the chosen method's and `matrix` (3, 3) that of it: body
-    components = matrix @ inertial components.  `triad` and `quest` stand side by
-    side with the angle between them.  `covariance_arcsec2` (3, 3) is the chosen
-    method's, of the small rotation about the body axes.  `residual_arcsec` has
-    one row a vector, the angle between the observed direction and the one that
-    the chosen attitude predicts, NaN where there is no reference to predict it
-    from.  `taste` is the weighted sum of squares at QUEST's attitude whichever
-    method is chosen, about chi-square with 2N - 3 degrees of freedom; beyond its
-    99.9 % point the solution is suspect.
+    `quaternion` is that of the chosen method, and `matrix` (3, 3) the same attitude: body
+    components = matrix @ inertial components. `triad` and `quest` are given with the angle between
+    them. `covariance_arcsec2` (3, 3) is the chosen method's, of the small rotation about the body
+    axes. `residual_arcsec` has one row per vector, the angle between the observed direction and the
+    one that the chosen attitude predicts, NaN for a star without an identity. `taste` is the
+    weighted sum of squares at QUEST's attitude whichever method is chosen, about chi-square with 2N
+    - 3 degrees of freedom; beyond its 99.9 % point the solution is suspect.
 
-    Of an attitude that a tracker measured itself (`acquire.measured`) all that needs stars is NaN.
+    For an attitude measured by a tracker itself (`acquire.measured`) all values that need stars are
+    NaN.
     """
 
     quaternion: Vector
@@ -93,10 +92,9 @@ def solve_attitude(
 ) -> AttitudeSolution | NoAttitude:
     """The attitude of N matched unit vectors, or the reason for none.
 
-    `observed` (N, 3) is in body axes, `reference` (N, 3) inertial, sigma one
-    standard deviation per tangent axis in radians; `tracker_of` (N,) says which of
-    `trackers` saw each.  `method` (`quest` or `triad`) chooses whose quaternion,
-    covariance and residuals are the solution's.
+    `observed` (N, 3) is in body axes, `reference` (N, 3) inertial, sigma one standard deviation per
+    tangent axis in radians; `tracker_of` (N,) is the index in `trackers` for each star. `method`
+    (`quest` or `triad`) selects the quaternion, covariance and residuals of the solution.
     """
     n = len(observed)
     if n < 2:
@@ -113,7 +111,7 @@ def solve_attitude(
 
 
 def fit_workspace(n: int) -> FitWorkspace:
-    """Room for what `fit_attitude` writes of n vectors."""
+    """Empty output arrays of `fit_attitude` for n vectors."""
     return FitWorkspace(
         quaternions=np.empty((3, 4)),
         attitude=np.empty((3, 3)),
@@ -124,7 +122,7 @@ def fit_workspace(n: int) -> FitWorkspace:
 
 
 def solution_of(workspace: FitWorkspace, matched: int, method: str) -> AttitudeSolution:
-    """The solution that `fit_attitude` wrote, of so many matched vectors; its arrays are locked."""
+    """The solution from the arrays filled by `fit_attitude`, which become read-only."""
     rms_arcsec, predicted_arcsec, taste, apart_arcsec = workspace.figures.tolist()
     freedom = 2 * matched - 3
     for array in workspace:
@@ -150,11 +148,10 @@ def solution_of(workspace: FitWorkspace, matched: int, method: str) -> AttitudeS
 
 @lru_cache(maxsize=1024)
 def taste_bound(degrees_of_freedom: int) -> float:
-    """The 99.9 % point of chi-square: beyond it a solution is suspect.
+    """The 99.9 % point of chi-square, above which a solution's TASTE is suspect.
 
-    `degrees_of_freedom` is odd, as 2 N - 3 is.  By Newton's steps on the
-    logarithm of the tail; scipy, which knows it too, takes longer to load than
-    the first hundred batches to solve.
+    `degrees_of_freedom` is odd, as 2 N - 3 is. Computed by Newton steps on the logarithm of the
+    tail, because importing scipy takes longer than solving a hundred batches.
     """
     bound = float(degrees_of_freedom) + 10.0
     for _ in range(100):
@@ -167,7 +164,7 @@ def taste_bound(degrees_of_freedom: int) -> float:
 
 
 def _chi_square(x: float, odd: int) -> tuple[float, float]:
-    """The probability of more than x, and the density there, of chi-square with `odd` degrees."""
+    """The tail probability beyond x, and the density at x, of chi-square with `odd` degrees."""
     half = odd / 2.0
     density = math.exp((half - 1.0) * math.log(x / 2.0) - x / 2.0 - math.lgamma(half)) / 2.0
     # Abramowitz & Stegun 26.4.4: each two degrees add twice the density of the sum.
@@ -186,7 +183,9 @@ def tracker_fits(
     tracker_of: npt.NDArray[np.int64],
     trackers: tuple[str, ...],
 ) -> tuple[TrackerFit, ...]:
-    """Each tracker's share of TASTE, and whether it is the one that does not agree."""
+    """Each tracker's contribution to TASTE, and true for a tracker that disagrees with the
+    others.
+    """
     quest = matrix_from_quaternion(solution.quest)
     weighted = np.sum((observed - reference @ quest.T) ** 2, axis=1) / sigma_rad**2
     stars = np.bincount(tracker_of, minlength=len(trackers))
@@ -201,11 +200,11 @@ def tracker_fits(
 def _outlier(
     observed: Vector, reference: Vector, sigma_rad: Vector, tracker_of: npt.NDArray[np.int64]
 ) -> int:
-    """The tracker without which the rest agrees best; -1 where it never agrees, or two are alike.
+    """The tracker without which the rest agrees best; -1 if the rest never agrees or two tie.
 
-    The shares of TASTE do not tell: a misaligned tracker with most of the stars
-    pulls the joint attitude to itself, and the others look worse.  Of two
-    trackers that disagree, each in itself sound, neither can be named.
+    The contributions to TASTE are misleading: a misaligned tracker with most of the stars dominates
+    the joint attitude, and the others look worse. If two trackers disagree and each is consistent
+    in itself, neither can be named.
     """
     from scipy.special import chdtrc
 

@@ -1,4 +1,4 @@
-"""TRIAD, its covariance, and the pairs of vectors to take, compiled.
+"""The TRIAD method, compiled, with its covariance and the choice of vector pairs.
 
 b are observed unit vectors in body axes, r the reference vectors in inertial
 axes, weights are sigma^-2 with sigma in radians.
@@ -9,7 +9,7 @@ import math
 from service.compiled.jit import njit_no_refcount
 
 LEAST_SINE = 1e-12
-"""Below this two vectors stand in one line."""
+"""Least sine of the angle between two vectors that are not collinear."""
 
 
 @njit_no_refcount
@@ -23,11 +23,10 @@ def sine(a, b):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def widest_pair(b, r, weights):  # type: ignore[no-untyped-def]
-    """The two rows with the largest sine between them, the smaller sigma first, and that sine.
+    """The rows of the vector pair with the largest sine, the smaller sigma first, and that sine.
 
-    The sine is that of the references, which have no noise: the pair that is
-    widest as observed is too wide on average.  Two stars that were given one
-    identity have a sine of zero.
+    The sine is that of the references, which have no noise: the widest observed pair would be
+    biased. Two stars with the same identity have a sine of zero.
     """
     first, second, widest = 0, 1, 0.0
     for i in range(len(r) - 1):
@@ -42,7 +41,10 @@ def widest_pair(b, r, weights):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def firmest_pair(b, r, weights):  # type: ignore[no-untyped-def]
-    """The finest star, and the one that best fixes the turn about it by weight times sine^2."""
+    """The rows of the most accurate star, and of the star that best fixes the rotation about it.
+
+    The second star has the largest weight times sine^2.
+    """
     first, second, firmest = 0, 0, 0.0
     for i in range(len(b)):
         if weights[i] > weights[first]:
@@ -56,7 +58,7 @@ def firmest_pair(b, r, weights):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def _triad_frame(anchor, other):  # type: ignore[no-untyped-def]
-    """The second and third axis of the frame whose first is the anchor."""
+    """The second and third axis of a frame whose first axis is the anchor."""
     x = anchor[1] * other[2] - anchor[2] * other[1]
     y = anchor[2] * other[0] - anchor[0] * other[2]
     z = anchor[0] * other[1] - anchor[1] * other[0]
@@ -72,7 +74,9 @@ def _triad_frame(anchor, other):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def triad(b1, b2, r1, r2, attitude):  # type: ignore[no-untyped-def]
-    """The matrix that takes r1 to b1 exactly and r2 into the plane of b1 and b2 (Black 1964)."""
+    """Write the matrix that maps r1 to b1 exactly, and r2 into the plane of b1 and b2 (Black
+    1964).
+    """
     body2, body3 = _triad_frame(b1, b2)
     inertial2, inertial3 = _triad_frame(r1, r2)
     for i in range(3):
@@ -82,10 +86,11 @@ def triad(b1, b2, r1, r2, attitude):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def triad_covariance(b1, b2, variance1, variance2, covariance):  # type: ignore[no-untyped-def]
-    """The covariance (3, 3) of `triad`, about the body axes, to first order (Shuster & Oh 1981).
+    """The covariance (3, 3) of TRIAD's attitude about the body axes, to first order (Shuster & Oh
+    1981).
 
-    The noise of b1 along both its tangent axes and that of b2 across the plane
-    enter; that of b2 in the plane does not.
+    It includes the noise of b1 along both of its tangent axes and that of b2 across the plane, but
+    not that of b2 in the plane.
     """
     cosine = b1[0] * b2[0] + b1[1] * b2[1] + b1[2] * b2[2]
     sine2 = sine(b1, b2) ** 2

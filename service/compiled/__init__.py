@@ -1,1 +1,1 @@
-"""Everything about numba: how kernels are compiled, arrays in them, the kernel cache."""
+"""Numba support: compilation of kernels, their array functions, and the kernel cache."""

@@ -1,4 +1,6 @@
-"""Arrays in compiled code: copies, and views without an owner, which are never to be returned."""
+"""Array functions for compiled code: copies, and views without an owner, which must not be
+returned.
+"""
 
 from typing import Any
 
@@ -27,15 +29,15 @@ def _borrowed_view(_: Any, held: Any) -> Any:
                 value = builder.insert_value(value, freed, at)
         return value
 
-    # numba gives `signature` no types.
+    # numba's `signature` has no type annotations.
     return signature(held, held), generate  # type: ignore[no-untyped-call]
 
 
 borrowed_view: Any = intrinsic(_borrowed_view)
-"""The same array, or named tuple of arrays, without an owner: no reference to it is counted.
+"""Array, or a named tuple of arrays, as a view without an owner, which needs no reference counting.
 
-For what a compiled function was given as an argument and passes on, for as long
-as it runs: its caller holds the arrays meanwhile.  Never to be returned.
+For arguments of a compiled function that it passes on while it runs: its caller holds the arrays
+meanwhile. The view must not be returned.
 """
 
 
@@ -72,19 +74,20 @@ def _view_into(_: Any, block: Any, first_byte: Any, shape: Any, dtype: Any) -> A
 
 
 view_into: Any = intrinsic(_view_into)
-"""`view_into(block, first_byte, shape, dtype)`: an array within a block, without an owner.
+"""`view_into(block, first_byte, shape, dtype)`: an array within a block, as a view without an
+owner.
 
-The caller holds the block for as long as it runs.  Costs nothing, where a slice, a view
-and a shape of it are three calls.
+The caller holds the block while it uses the view. This costs nothing, while slicing, viewing and
+reshaping are three calls.
 """
 
 
 @njit_no_refcount
 def copy_rows(source, target):  # type: ignore[no-untyped-def]
-    """Write an array of one or more dimensions over another of the same shape.
+    """Copy an array of one or more dimensions into another of the same shape.
 
-    `target[:] = source` takes three seconds to compile, most of them for the message of an
-    error about their shapes.
+    `target[:] = source` takes three seconds to compile, most of them for the error message about
+    shapes.
     """
     for at in range(source.size):
         target.flat[at] = source.flat[at]

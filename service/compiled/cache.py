@@ -1,8 +1,7 @@
-"""The folder of compiled kernels, one for every state of the source.
+"""The folder of compiled kernels, one for every state of the source code.
 
-numba looks only at the file of the kernel it loads, not at those whose code or
-constants were compiled into it: after an edit or an update of one of them it
-would go on with the old code.
+numba checks only the file of a kernel, not the files whose code or constants were compiled into it:
+after a change of one of these it would use outdated code.
 """
 
 import hashlib
@@ -37,14 +36,14 @@ SOURCES = (
     "service/vectors.py",
     "studies/ptp_2015/rivals",
 )
-"""Patterns of folders and files with every module with compiled code, and all that these import."""
+"""Patterns of all source files with compiled code, and of the files that they import."""
 
 
 def keep_kernels_apart() -> None:
-    """Give the present state of the source its own folder of compiled kernels.
+    """Select the kernel cache folder that belongs to the present state of the source code.
 
-    numba reads the environment when it is imported; where it was imported first, its
-    setting is changed as well.  A folder that the environment names already stays.
+    numba reads the environment when it is imported; if it was imported before, its setting is
+    changed too. A folder set in the environment is kept.
     """
     folder = os.environ.get("NUMBA_CACHE_DIR") or str(_folder())
     os.environ["NUMBA_CACHE_DIR"] = folder
@@ -54,7 +53,7 @@ def keep_kernels_apart() -> None:
 
 @cache
 def source_digest() -> str:
-    """The digest of `SOURCES`, in hexadecimal digits."""
+    """The SHA-256 digest of all files in `SOURCES`, in hexadecimal."""
     state = hashlib.sha256()
     for path in sorted(path for source in SOURCES for path in source_files(source)):
         state.update(path.relative_to(PACKAGE.parent).as_posix().encode() + path.read_bytes())
@@ -62,7 +61,7 @@ def source_digest() -> str:
 
 
 def source_files(pattern: str) -> Iterator[Path]:
-    """The Python files of a pattern of `SOURCES`."""
+    """The Python files that match a pattern of `SOURCES`."""
     for place in PACKAGE.parent.glob(pattern):
         yield from place.rglob("*.py") if place.is_dir() else [place]
 

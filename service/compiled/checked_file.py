@@ -1,7 +1,7 @@
-"""numba's files of compiled kernels, each behind the digest of its content.
+"""numba's cache files of compiled kernels, protected by digests of their content.
 
-A file that was cut, zeroed or changed would end in a traceback at each start, or in machine code
-that computes something else.  Such a file is removed, and its kernel compiled again.
+A truncated or changed file would cause a traceback at each start, or wrong machine code. Such a
+file is removed, and its kernel compiled again.
 """
 
 import hashlib
@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 
 
 class CheckedFile(IndexDataCacheFile):
-    """The index and the data of one kernel."""
+    """The cache files of one kernel, its index and its data, with checked digests."""
 
     def _load_index(self) -> Any:
         try:
@@ -50,7 +50,7 @@ class CheckedFile(IndexDataCacheFile):
 
 
 def content_of(path: Path) -> bytes:
-    """The content of a file; one that is damaged is removed, and is not found."""
+    """Content of a cache file; raises `FileNotFoundError` for a damaged one, which is removed."""
     written = path.read_bytes()
     digest, content = written[:_BYTES], written[_BYTES:]
     if _DIGEST(content).digest() == digest:
@@ -61,7 +61,7 @@ def content_of(path: Path) -> bytes:
 
 
 def count_whole(folder: Path) -> int:
-    """The number of files with kernels in a folder; damaged ones are removed."""
+    """The number of intact kernel files in a folder; damaged ones are removed."""
     count = 0
     for path in folder.rglob("*"):
         if path.suffix in SUFFIXES:

@@ -1,15 +1,14 @@
-"""How kernels are compiled: as parts of one another, without counting references.
+"""Compilation of kernels with numba: callers include their callees, and references are not counted.
 
-numba optimises every kernel and makes machine code of it, with all that it calls, before it
-links it into its callers, where the same is done again: once for each level of calls.  That was
-half of the time of compiling.  Here a kernel that another one calls is only typed and translated;
-the one that Python calls is optimised as a whole, and it alone is kept in the cache on disk.
-The same is done with the functions of numba's own that a kernel calls, such as sorts.
+numba optimises every kernel with its callees and generates machine code before linking it into its
+callers, where this is repeated at each level of calls. That took half of the compile time. Here a
+kernel called by another one is only typed and translated; the one called by Python is optimised as
+a whole, and only that one is cached on disk. The same applies to numba's own functions that a
+kernel calls, such as sorts.
 
-numba also counts, by an atomic increment and decrement, every array that a function
-is given or that is taken from a tuple or cut out of another.  It leaves out what
-it can prove to be in vain, but proves nothing in large functions.  In kernels
-that work for a microsecond that was the largest single cost: `njit_no_refcount`.
+numba also counts references, with atomic operations, to every array argument, tuple element and
+slice. It omits counts that it can prove redundant, but not in large functions. In kernels that take
+a microsecond that was the largest single cost; `njit_no_refcount` avoids it.
 """
 
 import errno
@@ -36,13 +35,13 @@ _SCIPY = "scipy.linalg"
 
 
 def _leave_scipy_out() -> None:
-    """Have numba load its functions of arrays as where scipy is not installed.
+    """Make numba load its array functions as if scipy were not installed.
 
-    It needs scipy for matrix products in kernels, of which there are none here; loading it is a
-    tenth of the start and 40 MB of each process.
+    numba needs scipy only for matrix products, which no kernel here uses; importing it takes a
+    tenth of the start and 40 MB per process.
     """
     if _SCIPY not in sys.modules:
-        # None makes an import fail, which the types of the standard library do not know.
+        # None makes an import fail, which the type stubs of the standard library do not allow for.
         sys.modules[_SCIPY] = None  # type: ignore[assignment]
         try:
             importlib.import_module("numba.np.arraymath")
@@ -54,37 +53,37 @@ _leave_scipy_out()
 
 
 def njit(*function: Callable[..., Any], **options: Any) -> Any:
-    """Compile a kernel, with the options of `numba.njit`; the cache on disk keeps it."""
+    """A decorator that compiles a kernel with the options of `numba.njit`, cached on disk."""
     if function:
         return Kernel(*function, **options)
     return lambda kernel: Kernel(kernel, **options)
 
 
 def njit_no_refcount(kernel: Callable[..., Any]) -> Any:
-    """Compile a kernel that counts no references: its caller holds all that it is given.
+    """A decorator for kernels without reference counting: the caller holds all arguments.
 
-    Without numba's runtime it cannot make an array either: one that tries to
-    does not compile.  Only for kernels that return no array, and call none that
-    returns one: that array would never be freed.
+    Such a kernel cannot create arrays, because numba's runtime is off: otherwise it does not
+    compile. It must not return an array, nor call a kernel that does, since that array would never
+    be freed.
     """
     return _compiled(kernel, error_model="numpy", _nrt=False)
 
 
 def njit_inlined(kernel: Callable[..., Any]) -> Any:
-    """`njit_no_refcount` for a part of a kernel that is copied into each of its callers.
+    """A decorator like `njit_no_refcount` for a part of a kernel that is inlined into each caller.
 
-    A named tuple of arrays is passed as tens of numbers, and the compiler does not see
-    which of them the part uses: called for every pair of stars, that took as long as its work.
-    What the part calls is not copied by that.
+    A named tuple of arrays is passed as tens of numbers, and the compiler does not see which of
+    them are used: for a function called per star pair, that took as long as its work. Callees of
+    the part are not inlined by this.
     """
     return _compiled(kernel, error_model="numpy", _nrt=False, forceinline=True)
 
 
 def njit_allocating(kernel: Callable[..., Any]) -> Any:
-    """Compile a kernel that makes arrays for itself although its caller counts no references.
+    """A decorator for kernels that create arrays internally, although their caller counts no
+    references.
 
-    Without this it would be compiled as its caller is.  It returns numbers alone,
-    as that does.
+    Otherwise it would be compiled as its caller is. Like that caller it returns only numbers.
     """
     return _compiled(kernel, _nrt=True)
 
@@ -94,20 +93,20 @@ def _compiled(kernel: Callable[..., Any], **options: Any) -> Any:
 
 
 class Kernel(CPUDispatcher):
-    """A compiled function: for Python with machine code, from the cache; for kernels without.
+    """A compiled function, with cached machine code for Python, and without for other kernels.
 
     Options are those of `numba.njit`.
     """
 
     def __init__(self, function: Callable[..., Any], **options: Any) -> None:
         options["nopython"] = True
-        # numba would hand this on from a kernel to all that it calls, and those call.
+        # numba would pass this on from a kernel to its callees and theirs.
         options.setdefault("forceinline", False)
         super().__init__(function, targetoptions=options, pipeline_class=_ForPython)
         try:
             self._cache = _LockedCache(function)
         except RuntimeError:
-            # numba found no place that can be written, and says so of the function.
+            # numba found no writable folder, and its message names only the function.
             raise OSError(
                 errno.EACCES,
                 "compiled kernels cannot be stored there: name a folder that this user can write "
@@ -118,7 +117,7 @@ class Kernel(CPUDispatcher):
         self._inner = CPUDispatcher(function, targetoptions=options | without)
 
     def compile(self, sig: Any) -> Any:
-        """Load or compile the kernel for a signature, one thread at a time."""
+        """Load the kernel for a signature from the cache, or compile it; one thread at a time."""
         with global_compiler_lock:
             try:
                 return super().compile(sig)
@@ -127,14 +126,14 @@ class Kernel(CPUDispatcher):
 
     @property
     def _numba_type_(self) -> Any:
-        """What kernels call where they name this one."""
+        """The numba type that represents this kernel when another kernel calls it."""
         return self._inner._numba_type_
 
 
 class _LockedCache(FunctionCache):
-    """numba's cache on disk; of several processes that need a kernel one compiles it.
+    """numba's cache on disk with a lock, so that only one of several processes compiles a kernel.
 
-    The others wait, and load what it saved.
+    The other processes wait, and load the saved kernel.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -145,7 +144,7 @@ class _LockedCache(FunctionCache):
         self._lock: IO[str] | None = None
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Load a kernel; if there is none, lock it for saving, until `unlock` is called."""
+        """Load a kernel from the cache; if it is missing, lock it until `unlock` is called."""
         load: Callable[..., Any] = super().load_overload
         kernel = load(sig, target_context)
         if kernel is None and self._lock is None:
@@ -158,17 +157,17 @@ class _LockedCache(FunctionCache):
         return kernel
 
     def unlock(self) -> None:
-        """Let other processes load the kernel, or compile it."""
+        """Release the lock, so that other processes load or compile the kernel."""
         if self._lock is not None:
             self._lock.close()
             self._lock = None
 
 
 class _ForPython(CompilerBase):
-    """numba's compiler, into a library with machine code; what it calls has none."""
+    """numba's compiler for kernels called by Python, into a library with machine code."""
 
     def compile_extra(self, func: Any) -> Any:
-        """Compile a function."""
+        """Compile a function into a library with machine code; its callees stay bitcode."""
         backend = self.state.targetctx.codegen()
         self.state.library = _MachineCodeLibrary(backend, func.__qualname__)  # type: ignore[no-untyped-call]
         self.state.library.enable_object_caching()
@@ -184,13 +183,13 @@ class _ForPython(CompilerBase):
 
 
 class _MachineCodeLibrary(JITCodeLibrary):
-    """A kernel that Python calls; no kernel is linked with it.
+    """The machine code of a kernel that Python calls, which is never linked into another kernel.
 
-    The cache would keep its bitcode as well, for linking, which every process would load.
+    Otherwise the cache would also store bitcode for linking, which every process would load.
     """
 
     def _get_module_for_linking(self) -> Any:
-        """Functions of the same names, without code: numba finds the machine code by these."""
+        """Module of empty functions with the right names, by which numba finds the machine code."""
         names = [each.name for each in self._final_module.functions if not each.is_declaration]
         return parse_assembly(
             "".join(f'define void @"{name}"() {{ ret void }}\n' for name in names)
@@ -198,14 +197,14 @@ class _MachineCodeLibrary(JITCodeLibrary):
 
 
 class _BitcodeLibrary(JITCodeLibrary):
-    """A function and what it calls, ready for linking and nothing else."""
+    """The bitcode of a function and its callees, for linking into a kernel only."""
 
     @property
     def codegen(self) -> Any:
         return _WithoutEnvironment(self._codegen)
 
     def _optimize_final_module(self) -> None:
-        """Left to the kernel that this function is linked into."""
+        """Do nothing: the kernel that includes this function is optimised as a whole."""
 
     def _finalize_final_module(self) -> None:
         self._finalize_dynamic_globals()  # type: ignore[no-untyped-call]
@@ -213,12 +212,12 @@ class _BitcodeLibrary(JITCodeLibrary):
         self._finalized = True
 
     def get_pointer_to_function(self, name: str) -> int:
-        """There is no machine code."""
+        """Zero, since there is no machine code."""
         return 0
 
 
 class _WithoutEnvironment:
-    """A code generator for code that is not made into machine code: no environment is set."""
+    """A code generator for code that stays bitcode: it sets no environment."""
 
     def __init__(self, codegen: Any) -> None:
         self._own = codegen
@@ -227,4 +226,4 @@ class _WithoutEnvironment:
         return getattr(self._own, name)
 
     def set_env(self, name: str, environment: Any) -> None:
-        """Only machine code has a place for it."""
+        """Do nothing: only machine code has room for an environment."""

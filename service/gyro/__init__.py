@@ -1,1 +1,1 @@
-"""Gyros: blocks of rates as they are sent and stored, and what is believed of them."""
+"""Gyros: blocks of measured rates as sent and stored, and the error model."""

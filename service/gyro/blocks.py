@@ -1,4 +1,4 @@
-"""Gyro blocks: rates about three axes at rising times, their JSON, and their packed form."""
+"""Gyro blocks: rates about three axes at rising times, as JSON and in compressed form."""
 
 import hashlib
 import math
@@ -23,11 +23,11 @@ Nanoseconds = npt.NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class GyroBlock:
-    """The samples of one gyro block, which passed every check.
+    """A checked gyro block: its samples, and the names of spacecraft, run and block.
 
-    `rates_rad_per_s` has the shape (n, 3), in the axes that the mission gives its gyro;
-    `times_s` has the shape (n,), in seconds of TAI after `start`, which is the time of the
-    first sample.  `step_s` is the interval where the block was sent with one, else None.
+    `rates_rad_per_s` has the shape (n, 3), in the gyro axes that the mission defines; `times_s` has
+    the shape (n,), in seconds of TAI after `start`, which is the time of the first sample. `step_s`
+    is the constant interval if the block was sent with one, else None.
     """
 
     spacecraft: str
@@ -40,7 +40,7 @@ class GyroBlock:
 
     @property
     def tai_ns(self) -> Nanoseconds:
-        """The times of the samples as `Utc.tai_ns`."""
+        """The times of the samples in nanoseconds, as `Utc.tai_ns`."""
         return tai_ns_of(self.start.tai_ns, self.times_s)
 
     @property
@@ -50,9 +50,9 @@ class GyroBlock:
 
     @property
     def fingerprint(self) -> str:
-        """The digest of everything that was sent.
+        """A digest of the block's content.
 
-        White space, the order of keys and the form of a time make no other body.
+        White space, the order of keys and the format of times do not change it.
         """
         digest = hashlib.sha256()
         for text in (self.spacecraft, self.run, self.block, self.start.text, repr(self.step_s)):
@@ -63,12 +63,12 @@ class GyroBlock:
 
 
 def times_of_steps(step_s: float, samples: int) -> Vector:
-    """Seconds from the first of so many samples, `step_s` apart."""
+    """The times of samples at a constant step, in seconds from the first sample."""
     return np.arange(samples, dtype=np.float64) * step_s
 
 
 def texts_of(start: Utc, times_s: Vector) -> list[str]:
-    """The UTC texts, as of `Utc.text`, of times in seconds of TAI after a start."""
+    """The UTC texts, in the format of `Utc.text`, of times in seconds of TAI after a start."""
     tai1, tai2, _ = ufunc.utctai(start.jd1, start.jd2)
     utc1, utc2, _ = ufunc.taiutc(tai1, tai2 + times_s / DAY_S)
     years, months, days, clocks, _ = ufunc.d2dtf(b"UTC", 9, utc1, utc2)
@@ -81,24 +81,24 @@ def texts_of(start: Utc, times_s: Vector) -> list[str]:
 
 
 def tai_ns_of(start_ns: int, times_s: Vector) -> Nanoseconds:
-    """Times as `Utc.tai_ns`, from seconds after a start."""
+    """Times in nanoseconds as `Utc.tai_ns`, from seconds after a start."""
     return start_ns + np.rint(times_s * 1e9).astype(np.int64)
 
 
 SAME_TIME_NS = 1_000
-"""Samples nearer than this have the same time.
+"""Difference in nanoseconds below which two samples have the same time.
 
-Times are sent with a start that is rounded and steps that are added up, so the same sample in two
-blocks may differ by some nanoseconds.
+Times are sent as a rounded start plus accumulated steps, so that the same sample in two blocks may
+differ by some nanoseconds.
 """
 
 
 class SampleTaken(Conflict):
-    """A sample at a time that another block of the spacecraft and the run holds."""
+    """An error: a sample's time occurs in another block of the same spacecraft and run."""
 
 
 def first_shared_ns(times_ns: Nanoseconds, others_ns: Nanoseconds) -> int | None:
-    """The first of the times that another block holds, or None; both in rising order."""
+    """The first of the times that also occurs in another block, or None; both sorted."""
     place = np.searchsorted(others_ns, times_ns)
     after = others_ns[np.minimum(place, others_ns.size - 1)]
     before = others_ns[np.maximum(place - 1, 0)]
@@ -107,22 +107,20 @@ def first_shared_ns(times_ns: Nanoseconds, others_ns: Nanoseconds) -> int | None
     return int(times_ns[shared[0]]) if shared.size else None
 
 
-# Arrays of floating-point numbers as compressed bytes, and back, bit for bit.
-#
-# A gyro counts, so its rates are few different numbers: zlib finds them again where they stand
-# whole, and takes two bytes for most.
+# Lossless compression of floating-point arrays to bytes, and back. A gyro counts, so that its rates
+# have few different values: zlib finds repeated values and takes two bytes for most.
 
 LEVEL = 1
-"""The level of zlib; level 6 takes four times as long for about 2 % less."""
+"""Compression level of zlib; level 6 takes four times as long for about 2 % less."""
 
 
 def pack(values: Vector) -> bytes:
-    """The compressed bytes of an array of float64, column by column."""
+    """An array of float64 as compressed bytes, column by column."""
     return zlib.compress(np.ascontiguousarray(values.T, "<f8").tobytes(), LEVEL)
 
 
 def unpack(packed: bytes, shape: tuple[int, ...]) -> Vector:
-    """The array of a shape that `pack` was given.
+    """The array of a given shape from compressed bytes, the reverse of `pack`.
 
     Raises `ValueError` for bytes that are damaged or hold another number of values.
     """
@@ -135,16 +133,15 @@ def unpack(packed: bytes, shape: tuple[int, ...]) -> Vector:
     return np.ascontiguousarray(columns.reshape(shape[::-1]).T)
 
 
-# A gyro block as JSON, checked field by field.
-#
-# The route and the readers of telemetry files read blocks here, so that they refuse the same
-# things with the same words.  The pydantic models are also what `openapi.yaml` shows.
+# The JSON of a gyro block, checked field by field. The route and the readers of telemetry files
+# read blocks with these models, so that they refuse the same errors with the same messages. The
+# models also define `openapi.yaml`.
 
 MAX_SAMPLES = 10_000
 MIN_STEP_S = 1e-6
-"""`SAME_TIME_NS`: samples of one block have different times."""
+"""Least step in seconds, equal to `SAME_TIME_NS`: samples of one block have different times."""
 MAX_SPAN_S = 86_400.0
-"""The longest time from the first sample of a block to its last."""
+"""Longest time from the first to the last sample of a block, in seconds."""
 
 Offset = Annotated[Number, Field(ge=0, le=MAX_SPAN_S)]
 Rates = tuple[Number, Number, Number]
@@ -193,7 +190,7 @@ class GyroLineIn(GyroBlockIn):
 
 
 def block_from_json(body: bytes | str, spacecraft: str, run: str | None = None) -> GyroBlock:
-    """The block of a JSON body; `run`, where given, takes the place of the block's own.
+    """A gyro block from a JSON body; `run` overrides the block's own.
 
     Raises `BadBatch` with the faults, each naming field and value.
     """
@@ -201,13 +198,13 @@ def block_from_json(body: bytes | str, spacecraft: str, run: str | None = None) 
 
 
 def block_from_line(line: bytes | str, run: str | None = None) -> GyroBlock:
-    """The block of a line of a telemetry file; see `block_from_json`."""
+    """A gyro block from a line of a telemetry file; see `block_from_json`."""
     model = checked_by(GyroLineIn.model_validate_json, line)
     return block_from_model(model, model.spacecraft, run)
 
 
 class _Named(msgspec.Struct):
-    """The field that only a gyro block has."""
+    """The JSON field that distinguishes a gyro block from a batch."""
 
     rates_rad_per_s: msgspec.Raw | msgspec.UnsetType = msgspec.UNSET
 
@@ -216,8 +213,8 @@ _NAMED = msgspec.json.Decoder(_Named)
 
 
 def is_gyro_line(line: bytes) -> bool:
-    """True if a line of a telemetry file is a gyro block, and no batch."""
-    # Most lines are batches, which are not decoded for this.
+    """True if a line of a telemetry file is a gyro block, not a batch."""
+    # Most lines are batches, which need not be decoded for this test.
     if b'"rates_rad_per_s"' not in line:
         return False
     try:
@@ -227,7 +224,7 @@ def is_gyro_line(line: bytes) -> bool:
 
 
 def json_of_block(block: GyroBlock) -> bytes:
-    """The body of a request that sends a block, as `block_from_json` reads it."""
+    """A gyro block as the JSON body of a request, the reverse of `block_from_json`."""
     times = (
         {"times_s": block.times_s.tolist()} if block.step_s is None else {"step_s": block.step_s}
     )
@@ -237,7 +234,7 @@ def json_of_block(block: GyroBlock) -> bytes:
 
 
 def block_from_model(model: GyroBlockIn, spacecraft: str, run: str | None = None) -> GyroBlock:
-    """The block of a checked model; raises `BadBatch` for times that are none of a block."""
+    """A gyro block from a validated model; raises `BadBatch` for invalid times."""
     rates = np.array(model.rates_rad_per_s, np.float64)
     if model.step_s is not None:
         times_s = times_of_steps(model.step_s, len(rates))
@@ -259,7 +256,7 @@ def block_from_model(model: GyroBlockIn, spacecraft: str, run: str | None = None
 
 
 def _once(times_s: Vector, rates: Vector) -> tuple[Vector, Vector]:
-    """The samples without those that repeat the one before exactly, in time and rates."""
+    """The samples without exact repetitions of the previous one, in time and rates."""
     if times_s.size != len(rates):
         return times_s, rates
     again = (np.diff(times_s) == 0.0) & (np.diff(rates, axis=0) == 0.0).all(axis=1)
@@ -268,7 +265,7 @@ def _once(times_s: Vector, rates: Vector) -> tuple[Vector, Vector]:
 
 
 def _check_times(times_s: Vector, samples: int) -> None:
-    """Raise `BadBatch` unless there is a time for each sample, rising from zero."""
+    """Raise `BadBatch` unless there is one time per sample, rising from zero."""
     if times_s.size != samples:
         message = f"has {times_s.size} times for the {samples} samples of rates_rad_per_s"
         raise BadBatch(Fault("times_s", message))
@@ -284,7 +281,7 @@ def _check_times(times_s: Vector, samples: int) -> None:
 
 
 def require_rates_within(block: GyroBlock, largest_deg_per_s: float) -> None:
-    """Raise `BadBatch` for a rate beyond the largest that the mission allows."""
+    """Raise `BadBatch` for a rate above the largest that the mission allows."""
     largest = math.radians(largest_deg_per_s)
     beyond = np.argwhere(np.abs(block.rates_rad_per_s) > largest)
     if beyond.size:

@@ -1,4 +1,4 @@
-"""What is believed of a gyro, and its samples as mean rates about the body axes.
+"""The error model of a gyro, and its samples as mean rates about the body axes.
 
 The gyro gives w_measured = (I + M) w_true + b + n_v, db/dt = n_u, in body axes
 (Farrenkopf's model).  n_v and n_u are white with densities sigma_v^2 and
@@ -22,26 +22,24 @@ from service.vectors import ARCSEC_PER_RADIAN, Vector, read_only, rotation_vecto
 
 Times = npt.NDArray[np.int64]
 GAP_IN_STEPS = 1.5
-"""A step longer than this many median steps is a gap, unless the mission sets one."""
+"""Step above which an interval is a gap, in median steps, unless the mission sets a limit."""
 NS = 1e-9
 
 
 @dataclass(frozen=True)
 class GyroModel:
-    """One sigma of each error of a gyro, the same for its three axes.
+    """The error model of a gyro: one sigma of each error, the same for its three axes.
 
-    `sigma_v_rad_s0_5` is the angle random walk in rad/s^.5, `sigma_u_rad_s1_5`
-    the walk of the bias in rad/s^1.5, `bias_sigma_rad_s` the bias when nothing is
-    known of it.  `scale` and `misalignment_rad` are the errors that calibration
-    left: as M is constant, they shift the bias where the rate changes, and the
-    filter widens the bias there.
+    `sigma_v_rad_s0_5` is the angle random walk in rad/s^.5, `sigma_u_rad_s1_5` the random walk of
+    the bias in rad/s^1.5, `bias_sigma_rad_s` the initial uncertainty of the bias. `scale` and
+    `misalignment_rad` are errors left by calibration: since M is constant, they shift the bias
+    where the rate changes, and the filter enlarges the bias uncertainty there.
 
-    An interval between samples longer than `largest_step_s` is a gap: the rate is
-    taken from the samples on both sides, as a random walk of `coast_rad_s1_5`, and
-    the clock may have stepped by `clock_step_s`.  Samples beyond
-    `largest_rate_rad_s` are refused.
+    An interval between samples longer than `largest_step_s` is a gap: the rate is interpolated from
+    the samples on both sides, with a random walk of `coast_rad_s1_5`, and the clock may have
+    stepped by `clock_step_s`. Samples beyond `largest_rate_rad_s` are refused.
 
-    Quantisation of the angle is not modelled: it has to be small beside the trackers' noise.
+    Quantisation of the angle is not modelled: it must be small compared with the trackers' noise.
     """
 
     sigma_v_rad_s0_5: float
@@ -68,7 +66,7 @@ class GyroModel:
 
 @dataclass(frozen=True, eq=False)
 class GyroSamples:
-    """n samples of a gyro: `rate_rad_s` (n, 3) is the mean rate since the sample before.
+    """The samples of a gyro: `rate_rad_s` (n, 3) is the mean rate since the previous sample.
 
     Rates are about the body axes, times strictly increasing.
     """
@@ -81,7 +79,7 @@ class GyroSamples:
         set_values(self, "gyro", "rate_rad_s", (3,))
 
     def check(self, model: GyroModel) -> None:
-        """Raise `BadInput` where a rate is beyond what the gyro can measure."""
+        """Raise `BadInput` for rates beyond what the gyro can measure."""
         beyond = np.abs(self.rate_rad_s) > model.largest_rate_rad_s
         refuse_rows(
             "gyro.rate_rad_s",
@@ -92,16 +90,17 @@ class GyroSamples:
 
 
 def believed(settings: GyroSettings, rates_rad_s: Vector) -> npt.NDArray[np.bool_]:
-    """Marks (n,) of rates (n, 3) about the gyro's axes that are within the mission's largest.
+    """True (n,) for rates (n, 3) about the gyro's axes that are within the mission's largest rate.
 
-    Blocks beyond it are refused on arrival; the mission may have named another number since.
+    Blocks with larger rates are refused on arrival, but the mission may have changed its limit
+    since.
     """
     largest = math.radians(settings.largest_rate_deg_per_s)
     return np.asarray((np.abs(rates_rad_s) <= largest).all(axis=1))
 
 
 BIAS_SIGMAS = 6.0
-"""No bias of a gyro is as many of its sigmas."""
+"""Multiple of a gyro bias's sigma that no bias exceeds."""
 
 
 def turns_beside_bias(
@@ -111,11 +110,11 @@ def turns_beside_bias(
     covariance_rad2: Vector,
     carried_rad_s: Vector | None = None,
 ) -> npt.NDArray[np.bool_]:
-    """Marks (m - 1,) of the steps between m attitudes in which the body turned for certain.
+    """True (m - 1,) for the steps between m attitudes in which the body certainly rotated.
 
-    It turned by more than the attitudes' errors and a gyro's bias can make of a body at rest; by
-    the rates (m, 3) that batches carried where these are of more than a quarter turn, of which
-    the attitudes may show less or, of a whole turn, nothing.
+    The rotation exceeds what attitude errors and a gyro bias can explain for a body at rest. Where
+    the rates (m, 3) sent with batches give more than a quarter turn, they are used instead, since
+    attitudes may not show a full turn.
     """
     turn_rad = np.linalg.norm(rotation_vectors(quaternion[:-1], quaternion[1:]), axis=1)
     variance = np.trace(covariance_rad2, axis1=1, axis2=2)
@@ -132,9 +131,9 @@ def turns_beside_bias(
 def gyro_samples(
     settings: GyroSettings, tai_ns: Times, rates_rad_s: Vector
 ) -> tuple[GyroModel, GyroSamples]:
-    """The model and the samples of a stretch: mean rates since the sample before, in body axes.
+    """Error model and the samples of an interval: mean rates since the previous sample, body axes.
 
-    `tai_ns` (n,) rise, and `rates_rad_s` (n, 3) are as recorded, about the gyro's axes.
+    `tai_ns` (n,) are sorted, and `rates_rad_s` (n, 3) are as recorded, about the gyro's axes.
     """
     step_s = np.diff(tai_ns) * NS
     largest_step_s = settings.largest_step_s
@@ -153,14 +152,14 @@ def gyro_samples(
         scale=settings.scale,
         misalignment_rad=settings.misalignment_arcsec / ARCSEC_PER_RADIAN,
         largest_step_s=largest_step_s,
-        # The mission's is about each axis of the gyro, the filter's about each of the body.
+        # The mission's limit is about each gyro axis, the filter's about each body axis.
         largest_rate_rad_s=math.radians(settings.largest_rate_deg_per_s) * widest * (1.0 + 1e-9),
     )
     return model, GyroSamples(tai_ns, body)
 
 
 def set_times(record: Any, name: str, strictly: bool = False) -> None:
-    """Keep a copy of the times of a record, checked for their order."""
+    """Replace the times of a record by a checked copy, in rising order."""
     times = np.asarray(record.tai_ns)
     field = f"{name}.tai_ns"
     if times.ndim != 1 or times.dtype.kind not in "iu":
@@ -175,7 +174,7 @@ def set_times(record: Any, name: str, strictly: bool = False) -> None:
 
 
 def set_values(record: Any, name: str, field: str, shape: tuple[int, ...]) -> None:
-    """Keep a copy of an array, checked for shape and for numbers."""
+    """Replace an array of a record by a copy with checked shape and finite numbers."""
     shown, expected = f"{name}.{field}", (len(record.tai_ns), *shape)
     try:
         values = np.array(getattr(record, field), dtype=np.float64)
@@ -189,7 +188,7 @@ def set_values(record: Any, name: str, field: str, shape: tuple[int, ...]) -> No
 
 
 def refuse_rows(field: str, wrong: npt.ArrayLike, expected: str, values: npt.NDArray[Any]) -> None:
-    """Raise for the first row that is wrong, and say how many there are."""
+    """Raise `BadInput` for the first wrong row, with the number of wrong rows."""
     rows = np.flatnonzero(wrong)
     if len(rows):
         more = f"; {len(rows)} rows in all" if len(rows) > 1 else ""

@@ -1,4 +1,4 @@
-"""Calibration of a camera from pictures of the sky: one lens for all, an attitude for each."""
+"""Calibration of a camera from pictures of the sky: one lens for all, one attitude for each."""
 
 import math
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ from service.vectors import Matrix, Vector, rotate_about
 ROUNDS = 15
 OUTLIER_SIGMAS = 4.0
 OBSERVABLE = 0.5
-"""The share of its prior's sigma below which a parameter counts as seen in the pictures."""
+"""Ratio of a parameter's sigma to its prior's below which the pictures determine it."""
 LEAST_FLOOR_PX = 0.01
 LEAST_TOLD_PX = 0.05
 """Least predicted error of a place: bright stars would decide over the whole lens otherwise."""
@@ -29,13 +29,13 @@ LEAST_TOLD_PX = 0.05
 
 @dataclass(frozen=True)
 class CameraCalibration:
-    """A camera as its pictures show it.
+    """The result of a camera calibration: the lens with covariance, and residuals before and after.
 
-    `covariance` (4, 4) is of the logarithm of the focal length, the bend and the centre in
-    units of the half diagonal, scaled by the residuals.  Places and residuals are (n, 2):
-    before, with a focal length alone, of all stars, and after, without those left out.
-    `centroid_sigma_px` is the predicted error of a place, as an rms over the stars of `after_px`;
-    `sigma_floor_px` what is left beside it.
+    `covariance` (4, 4) is of the logarithm of the focal length, the bend and the centre in units of
+    the half diagonal, scaled by the residuals. Places and residuals are (n, 2): before, with only a
+    focal length, of all stars, and after, without rejected stars. `centroid_sigma_px` is the
+    predicted error of a place, as an rms over the stars of `after_px`; `sigma_floor_px` the
+    remaining error.
     """
 
     lens: Lens
@@ -57,20 +57,22 @@ class CameraCalibration:
 
     @property
     def rms_px(self) -> tuple[float, float]:
-        """The residuals per axis, before and after."""
+        """The rms residuals per axis in pixels, before and after the calibration."""
         before, after = (
             math.sqrt(float(np.mean(each**2))) for each in (self.before_px, self.after_px)
         )
         return before, after
 
     def sigma(self, number: int) -> float:
-        """One standard deviation of a parameter: 0 of log focal length, 1 bend, 2 and 3 centre."""
+        """One standard deviation of a lens parameter: 0 for log focal length, 1 bend, 2 and 3
+        centre.
+        """
         return float(math.sqrt(self.covariance[number, number]))
 
 
 @dataclass
 class _View:
-    """The stars of one picture, and its attitude as far as it is known."""
+    """The stars of one picture, with its current attitude in the calibration."""
 
     attitude: Matrix
     u_px: Vector
@@ -80,16 +82,16 @@ class _View:
 
     @property
     def sigma_px(self) -> Vector:
-        """The predicted errors of places, none better than what a lens's model may be."""
+        """Predicted errors of star places in pixels, at least the errors of the lens model."""
         return np.maximum(self.predicted_px, LEAST_SIGMA_PX)
 
 
 def calibrate_camera(
     results: Sequence[PictureResult], stars: Sequence[Vector]
 ) -> CameraCalibration:
-    """Fit one lens to pictures with attitudes; `stars` (n, 3) are the directions of their stars.
+    """Fit one lens to pictures with attitudes; `stars` (n, 3) has the star directions of each.
 
-    All pictures are of one size and none is without an attitude.
+    All pictures must have the same size and an attitude.
     """
     views = [_view(result, star) for result, star in zip(results, stars, strict=True)]
     first = results[0].attitude
@@ -102,7 +104,7 @@ def calibrate_camera(
     before_place = np.concatenate([np.column_stack([v.u_px, v.v_px]) for v in views])
     lens, covariance = _fit(plain, views, len(PARAMETERS))
     residual = [_residuals(lens, view) for view in views]
-    # A wrong or blended star is left out, and the lens fitted again.
+    # A wrong or blended star is rejected, and the lens is fitted again.
     for view, each in zip(views, residual, strict=True):
         usual = 1.48 * float(np.median(np.abs(np.concatenate(residual))))
         _keep(view, np.abs(each).max(axis=1) < OUTLIER_SIGMAS * max(usual, LEAST_FLOOR_PX))
@@ -147,7 +149,7 @@ def _view(result: PictureResult, star: Vector) -> _View:
 
 
 def _told_sigma(result: PictureResult) -> Vector:
-    """The predicted error of every identified star's place."""
+    """The predicted position error of every identified star, in pixels."""
     assert result.attitude is not None
     points = result.points
     places = zip(points.u_px.tolist(), points.v_px.tolist(), strict=True)
@@ -162,15 +164,16 @@ def _keep(view: _View, good: Vector) -> None:
 
 
 def _residuals(lens: Lens, view: _View) -> Vector:
-    """Observed minus predicted (n, 2) in pixels."""
+    """The residuals of a picture's stars, observed minus predicted places (n, 2) in pixels."""
     u, v = lens.places(view.star @ view.attitude.T)
     return np.column_stack([view.u_px - u, view.v_px - v])
 
 
 def _fit(lens: Lens, views: Sequence[_View], parameters: int) -> tuple[Lens, Matrix]:
-    """The lens's first so many parameters, every view's attitude eliminated, and their covariance.
+    """Fit the lens's first `parameters` parameters, with every picture's attitude eliminated.
 
-    The attitudes are left at the fit.  Robust: residuals beyond twice the usual pull less.
+    Returns the lens and the covariance of its parameters; the attitudes are updated in place. The
+    fit is robust: residuals beyond twice the usual size have less weight.
     """
     names = PARAMETERS[:parameters]
     free = np.array([0.0, *(getattr(lens, name) for name in names[1:])])
@@ -203,7 +206,7 @@ def _fit(lens: Lens, views: Sequence[_View], parameters: int) -> tuple[Lens, Mat
 
 
 def _remarks(covariance: Matrix, zero: Vector) -> list[str]:
-    """Remarks on what the pictures did not show."""
+    """Remarks on parameters that the pictures do not determine."""
     remarks = []
     if math.sqrt(covariance[1, 1]) > OBSERVABLE * BEND_PRIOR:
         remarks.append(
@@ -227,7 +230,7 @@ def _remarks(covariance: Matrix, zero: Vector) -> list[str]:
 
 
 def mission_text(name: str, found: CameraCalibration) -> str:
-    """The mission file of a calibrated camera, as TOML; what it leaves out follows from these."""
+    """The mission file of a calibrated camera as TOML; omitted settings have default values."""
     lens = found.lens
     term = lens.bend * (lens.focal_px / lens.radius_px) ** 2
     center_u, center_v = lens.center_px
