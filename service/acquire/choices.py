@@ -68,12 +68,12 @@ class Choices(Struct, frozen=True, eq=False, gc=False):
 
     @property
     def tolerances(self) -> Tolerances:
-        """The tolerances of the identification."""
+        """The tolerances of a batch's star identification."""
         return self.rules.tolerances
 
     @property
     def tests(self) -> Tests:
-        """The switches of the identification tests."""
+        """The switches of a batch's identification tests."""
         return self.rules.tests
 
 

@@ -74,7 +74,7 @@ class TrackerResult(Struct, frozen=True, eq=False, gc=False):
 
 
 class Path(StrEnum):
-    """The searches that led to an answer."""
+    """The kinds of search that led to a batch's answer."""
 
     ZONE = "zone"
     LOST_IN_SPACE = "lost_in_space"

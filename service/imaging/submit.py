@@ -51,7 +51,7 @@ MAX_SHARP_KEPT = 500
 
 
 class FrameIn(schema.Wire):
-    """What is told of a frame: the fields of a batch but its stars."""
+    """The metadata sent with a frame: the fields of a batch except its stars."""
 
     batch: schema.Key | None = None
     time: Annotated[str, AfterValidator(schema.is_time)] | None = None

@@ -285,7 +285,7 @@ def dotted_key(model: type[BaseModel], location: Sequence[str | int]) -> str:
 
 
 def allowed_keys(model: type[BaseModel], location: Sequence[str | int]) -> list[str]:
-    """The allowed keys of the table at a location."""
+    """The allowed keys of the table at a location in a file or request."""
     models = [model]
     for part in location:
         models = _after(models, part)[1]
@@ -315,7 +315,7 @@ def _steps(model: type[BaseModel], location: Sequence[str | int]) -> Iterator[st
 
 
 def _after(models: Models, part: str | int) -> tuple[bool, Models]:
-    """True if a part of a location is no tag of pydantic; and the tables below that part."""
+    """True if one part of an error's location is a key or index; and the tables at that part."""
     fields = [each.model_fields[part] for each in models if part in each.model_fields]
     if fields:
         return True, [found for field in fields for found in _models_in(field.annotation)]

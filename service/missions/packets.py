@@ -146,7 +146,7 @@ class PacketPrior(Strict):
     direction: Literal["inertial_to_body", "body_to_inertial"] = "inertial_to_body"
     frame: Literal["EME2000", "ICRF", "GCRF"] = "EME2000"
     time: PacketTime | None = None
-    """The time of an attitude with a time of its own; by default the time of its packet."""
+    """The parameters of the a priori attitude's own time; by default the time of its packet."""
     max_age_s: float = Field(default=10.0, gt=0, le=86400)
     """Largest time difference in seconds between stars and an attitude from another packet."""
     sun_pointed: bool = False
@@ -187,7 +187,7 @@ class PacketMeasurement(Strict):
     valid_labels: ValidLabels = _no_labels
     """The labels (or texts) of an enumerated parameter for which the packet holds an attitude."""
     time: PacketTime | None = None
-    """The time of an attitude with a time of its own; by default the time of its packet."""
+    """The parameters of the measured attitude's own time; by default the time of its packet."""
 
     @model_validator(mode="after")
     def _one_accuracy(self) -> Self:

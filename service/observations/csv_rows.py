@@ -305,7 +305,7 @@ class JoinedRows(ABC):
 
     @abstractmethod
     def take(self, row: CsvRow) -> None:
-        """Read the cells of a row; raises `BadCell`."""
+        """Read the cells of one CSV row of a batch or gyro block; raises `BadCell`."""
 
     @abstractmethod
     def body(self) -> Mapping[str, Any]:
@@ -375,7 +375,7 @@ class BatchRows(JoinedRows):
         self.rows = 0
 
     def take(self, row: CsvRow) -> None:
-        """Read the cells of a row; raises `BadCell`."""
+        """Read the cells of one CSV row of a batch; raises `BadCell`."""
         self.rows += 1
         if self.rows > MAX_ROWS:
             raise BadCell("batch", f"has more than {MAX_ROWS} rows", self.key[-1])

@@ -139,7 +139,7 @@ class CsvTable:
         return header
 
     def _lines(self) -> Iterator[Line]:
-        """The lines after the header, in the order of the file."""
+        """The lines of a CSV file after its header, in the order of the file."""
         self._stream.seek(self._rows_start)
         return physical_lines(self._stream, self._header_line)
 

@@ -34,7 +34,7 @@ class BlockRows(csv_rows.JoinedRows):
         self._taken: set[tuple[float, ...]] = set()
 
     def take(self, row: CsvRow) -> None:
-        """Read the cells of a row; raises `BadCell`."""
+        """Read the cells of one CSV row of a gyro block; raises `BadCell`."""
         try:
             time = parse_utc(row["time"])
         except BadInput as error:

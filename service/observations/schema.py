@@ -248,7 +248,7 @@ class FromLastIn(Wire):
 
 
 class TestsIn(Wire):
-    """Tests switched on or off."""
+    """Tests of the identification, switched on or off."""
 
     magnitude: bool | None = None
     cross_product: bool | None = None
@@ -258,7 +258,7 @@ class TestsIn(Wire):
 
 
 class TolerancesIn(Wire):
-    """Tolerances, with the names of the mission file."""
+    """Tolerances of the identification, with the names of the mission file."""
 
     pair_separation_max_deg: Annotated[Number, Field(ge=0.01, le=60)] | None = None
     separation_deg: Annotated[Number, Field(ge=0, le=5)] | None = None

@@ -132,7 +132,7 @@ def _aligned(at: int) -> int:
 
 
 def _write(path: Path, content: Content) -> bool:
-    """Write a file under another name and rename it; false if that fails."""
+    """Write a sky file under another name and rename it; false if that fails."""
     beside = path.with_suffix(".new")
     try:
         block = _block(content)

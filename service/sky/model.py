@@ -78,7 +78,7 @@ class SkyModel:
         build: Callable[[], Content],
         made_of: Callable[[Content], Kept],
     ) -> Kept:
-        """The object that `made_of` makes from a file's content, through the cache."""
+        """The object made by `made_of` from the content of a sky file, through the memory cache."""
 
         def find_builder() -> Executor | None:
             # Opening a file takes less time than waiting for another thread.

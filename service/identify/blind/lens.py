@@ -173,7 +173,7 @@ class LensFit:
 
     @property
     def parameters(self) -> int:
-        """The number of fitted parameters."""
+        """The number of fitted parameters of a lens and its attitude."""
         return len(self.covariance)
 
 

@@ -43,7 +43,9 @@ LEAST_REFINED = {FREE_SCALE: 4, SCALE_BEND: 6, SCALE_CENTER: 8}
 
 @dataclass(frozen=True)
 class Points:
-    """The points of a picture (n), the most likely stars first: places and sigmas in pixels."""
+    """Points of light in a picture (n), the most likely stars first: places and sigmas in
+    pixels.
+    """
 
     u_px: Vector
     v_px: Vector
@@ -224,7 +226,7 @@ def _refit(
 
 
 def _scale(fit: LensFit, sigma: Vector) -> float:
-    """The ratio of residuals to their sigmas, by the median, at least 1."""
+    """The median ratio of a fit's residuals to their sigmas, as a factor on sigmas; at least 1."""
     pull = np.abs(fit.residual_px) / sigma[:, None]
     # With few stars the fit absorbs a part of the residuals.
     freedom = max(pull.size - fit.parameters, 1) / pull.size

@@ -116,9 +116,7 @@ def _determinant(m):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def turn(t, e0, e1, e2):  # type: ignore[no-untyped-def]
-    """Rotate T in place to exp(-[e x]) T, by the quaternion (e/2, 1), which keeps it
-    orthonormal.
-    """
+    """Rotate an attitude matrix T in place by a vector e, to exp(-[e x]) T, kept orthonormal."""
     norm = 1.0 / math.sqrt(1.0 + 0.25 * (e0 * e0 + e1 * e1 + e2 * e2))
     x, y, z, c = 0.5 * e0 * norm, 0.5 * e1 * norm, 0.5 * e2 * norm, norm
     for j in range(3):

@@ -24,7 +24,7 @@ from service.sky.whole_sky.index import SkyIndex
 from service.vectors import ARCSEC_PER_RADIAN, Matrix, Vector, read_only
 
 SIGMA_FLOOR_ARCSEC = 1.5
-"""Least position sigma of a star in arcsec: the run catalog serves a year and has no parallaxes."""
+"""Least position sigma of a star in arcsec: an index serves a year and leaves parallax out."""
 AT_REST = np.zeros(3)
 COLOR_SIGMA_MAG = 0.3
 """Magnitude error beside the noise, from colours and variable stars."""

@@ -39,7 +39,7 @@ from service.vectors import ARCSEC_PER_RADIAN, Vector, locked
 
 IN_A_MIRROR = np.array([-1.0, 1.0, 1.0])
 SIGMA_FLOOR_ARCSEC = 1.0
-"""Least position sigma of a star in arcsec: the catalog serves a year and has no parallaxes."""
+"""Least position sigma of a star in arcsec: the guide serves a year and leaves parallax out."""
 
 Rows = npt.NDArray[np.int32]
 

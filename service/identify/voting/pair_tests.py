@@ -221,7 +221,7 @@ def _order_of(sighted, zone, polar, bounds, rules, pair, cross_square, a, b):  #
 
 @njit_inlined
 def _order_by_pole(pair, polar_a, polar_b, tolerance, order):  # type: ignore[no-untyped-def]
-    """Step 7 of STARID: larger polar angle with larger, smaller with smaller, within BANTOL2."""
+    """The order of a pair by polar angles, larger with larger, within BANTOL2 (STARID's step 7)."""
     greater = max(pair.polar_i, pair.polar_j) - max(polar_a, polar_b)
     lesser = min(pair.polar_i, pair.polar_j) - min(polar_a, polar_b)
     if abs(greater) > tolerance or abs(lesser) > tolerance:
@@ -234,7 +234,7 @@ def _order_by_pole(pair, polar_a, polar_b, tolerance, order):  # type: ignore[no
 
 @njit_inlined
 def _order_by_cross_product(pair, a, b, cross_square, order):  # type: ignore[no-untyped-def]
-    """Steps 4, 5 and 10 of STARID: CRSSEP, or its supplement CRSSEN for the other order."""
+    """The order of a pair by the angle between cross products, CRSSEP, or its supplement CRSSEN."""
     c0 = a[1] * b[2] - a[2] * b[1]
     c1 = a[2] * b[0] - a[0] * b[2]
     c2 = a[0] * b[1] - a[1] * b[0]
@@ -257,7 +257,7 @@ def _order_by_cross_product(pair, a, b, cross_square, order):  # type: ignore[no
 
 @njit_inlined
 def _order_by_rotation(sighted, bounds, tolerance, pair, star, a, b, order):  # type: ignore[no-untyped-def]
-    """The order of a pair, if its rotation of the field about the boresight is within tolerance."""
+    """The order of a pair of stars, if the field's rotation is within tolerance; else rejected."""
     first, second = sighted.direction[pair.i], sighted.direction[pair.j]
     boresight, axis, is_band = sighted.boresight, bounds.axis, bounds.is_band
     along, against = order >= 0, order <= 0

@@ -192,25 +192,25 @@ def psfs_in_colours(shortest: SampledPsf, longer: Array, weights: Array) -> list
 
 @dataclass(frozen=True)
 class ColouredPsf:
-    """The image of a star whose light is mixed of that of a blue star and that of a red one."""
+    """A star's image in its own colour, mixed from the images of a blue and a red star."""
 
     blue: Psf
     red: Psf
     red_share: float = 0.5
-    """Below 0 and above 1 for stars bluer or redder than both."""
+    """Share of the red star's image; below 0 for stars bluer than blue, above 1 for redder ones."""
 
     @property
     def fwhm_px(self) -> float:
-        """The mean of both widths."""
+        """The full width at half maximum in pixels, mixed from the widths of both images."""
         return (1.0 - self.red_share) * self.blue.fwhm_px + self.red_share * self.red.fwhm_px
 
     def pixel(self, du_px: npt.ArrayLike, dv_px: npt.ArrayLike) -> Array:
-        """See `Psf`."""
+        """The share of the light on pixels at (du, dv) from the star; see `Psf`."""
         blue, red = self.blue.pixel(du_px, dv_px), self.red.pixel(du_px, dv_px)
         return (1.0 - self.red_share) * blue + self.red_share * red
 
     def slopes(self, du_px: npt.ArrayLike, dv_px: npt.ArrayLike) -> tuple[Array, Array]:
-        """See `Psf`."""
+        """The derivatives of that share with respect to du and dv; see `Psf`."""
         (blue_u, blue_v), (red_u, red_v) = (
             each.slopes(du_px, dv_px) for each in (self.blue, self.red)
         )

@@ -18,7 +18,7 @@ from service.observations.scans.lines import BREAKDOWN_RATIO
 
 
 class Flag(StrEnum):
-    """A warning about a star's image."""
+    """A warning about the image of a star, such as saturation or a cut by the edge."""
 
     SATURATED = "saturated"
     EDGE = "edge"

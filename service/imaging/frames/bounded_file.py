@@ -29,7 +29,7 @@ class BoundedFile(io.RawIOBase):
 
     @property
     def stream(self) -> IO[bytes]:
-        """The same file, typed as the binary file object that libraries expect."""
+        """The bounded file, typed as the binary file object that libraries expect."""
         return cast("IO[bytes]", self)
 
     def readable(self) -> bool:
