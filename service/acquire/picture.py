@@ -553,9 +553,7 @@ def _of_the_middle(lens: Lens, attitude: Matrix) -> Matrix:
 
 
 def _turns_of_the_middle(fit: LensFit) -> Matrix:
-    """The rotation (3, p) of the middle's attitude in radians per unit of every parameter of the
-    fit.
-    """
+    """Rotation (3, p) of the middle's attitude, in radians, per unit of each fitted parameter."""
     turns = np.zeros((3, fit.parameters))
     unmoved = _of_the_middle(fit.lens, fit.attitude)
     step = 1e-6

@@ -35,9 +35,7 @@ from service.vectors import (
 )
 
 TrackingState = Literal["acquiring", "tracking", "lost"]
-"""Tracking states of a batch: found in the whole sky, near a prediction, or without a good
-attitude.
-"""
+"""Tracking states of a batch: found in the whole sky, near a prediction, or lost."""
 _COUNTED = [
     (int(each), each.word) for each in (Outcome.UNIQUE, Outcome.AMBIGUOUS, Outcome.UNMATCHED)
 ]

@@ -249,9 +249,7 @@ def _whole_sky_can_tell(corrected: Sequence[CorrectedObservations]) -> bool:
 CLUTTER = 0.1
 """Probability that a point is no catalog star, equal to the prior mean in `hypotheses.evidence`."""
 FAILED = 0.01
-"""Probability that a prediction has failed, for example at a flip that the mission does not
-declare.
-"""
+"""Probability that a prediction has failed, as at a flip that the mission does not declare."""
 GATE = 30.0
 """Chi-square (two degrees of freedom) beyond which catalog stars have no weight."""
 

@@ -105,9 +105,7 @@ class MeasuredInnovations(TimedColumns):
 
 
 def was_used(outcome: Integers) -> npt.NDArray[np.bool_]:
-    """True for outcomes (m,) of measurements that the filter used: accepted, or used for a
-    start.
-    """
+    """True for outcomes (m,) of measurements used by the filter: accepted, or used for a start."""
     return np.asarray((outcome == Outcome.ACCEPTED) | (outcome == Outcome.STARTED))
 
 

@@ -28,9 +28,7 @@ TRIAD, QUEST, START = 0, 1, 2
 PLAIN, WEIGHTED, EXPECTED = 0, 1, 2
 """Columns of the sums of squared residuals: unweighted, weighted, and predicted."""
 RMS, PREDICTED_RMS, TASTE, APART = 0, 1, 2, 3
-"""Indices of a fit's figures: rms residual, its prediction, TASTE, and the methods' difference
-angle.
-"""
+"""Indices of a fit's figures: rms residual, its prediction, TASTE, angle between methods."""
 
 
 class FitWorkspace(NamedTuple):

@@ -113,9 +113,7 @@ def predict_by_gyro(
 
 
 def _turned(known: Known, tai_ns: int, turn: Vector, added_rad2: Matrix) -> Known:
-    """A known attitude after a rotation, given as a quaternion, with covariance about the new
-    axes.
-    """
+    """A known attitude after a rotation, given as a quaternion; covariance about the new axes."""
     quaternion = _compose(turn[None], known.quaternion[None])[0]
     if quaternion[3] < 0.0:
         quaternion = -quaternion

@@ -14,8 +14,7 @@ POLISHING_STEPS = 10
 
 @njit_no_refcount
 def quest(b, r, weights, start, q, scratch):  # type: ignore[no-untyped-def]
-    """Solve Wahba's problem by QUEST (Shuster & Oh 1981) into `q`; `scratch` (3, 3, 3) is work
-    space.
+    """Solve Wahba's problem by QUEST (Shuster & Oh 1981) into `q`, with `scratch` (3, 3, 3).
 
     `start` is an approximate quaternion: its largest component selects a half turn by which the
     reference vectors are rotated first, so that the scalar part of the solved quaternion is never

@@ -183,9 +183,7 @@ def tracker_fits(
     tracker_of: npt.NDArray[np.int64],
     trackers: tuple[str, ...],
 ) -> tuple[TrackerFit, ...]:
-    """Each tracker's contribution to TASTE, and true for a tracker that disagrees with the
-    others.
-    """
+    """Each tracker's contribution to TASTE, and true for one that disagrees with the others."""
     quest = matrix_from_quaternion(solution.quest)
     weighted = np.sum((observed - reference @ quest.T) ** 2, axis=1) / sigma_rad**2
     stars = np.bincount(tracker_of, minlength=len(trackers))

@@ -74,9 +74,7 @@ def _triad_frame(anchor, other):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def triad(b1, b2, r1, r2, attitude):  # type: ignore[no-untyped-def]
-    """Write the matrix that maps r1 to b1 exactly, and r2 into the plane of b1 and b2 (Black
-    1964).
-    """
+    """Write the matrix that maps r1 to b1, and r2 into the plane of b1 and b2 (Black 1964)."""
     body2, body3 = _triad_frame(b1, b2)
     inertial2, inertial3 = _triad_frame(r1, r2)
     for i in range(3):
@@ -86,8 +84,7 @@ def triad(b1, b2, r1, r2, attitude):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def triad_covariance(b1, b2, variance1, variance2, covariance):  # type: ignore[no-untyped-def]
-    """The covariance (3, 3) of TRIAD's attitude about the body axes, to first order (Shuster & Oh
-    1981).
+    """Covariance (3, 3) of TRIAD's attitude, body axes, to first order (Shuster & Oh 1981).
 
     It includes the noise of b1 along both of its tangent axes and that of b2 across the plane, but
     not that of b2 in the plane.

@@ -1,6 +1,4 @@
-"""Array functions for compiled code: copies, and views without an owner, which must not be
-returned.
-"""
+"""Array functions for compiled code: copies, and views without an owner, never to be returned."""
 
 from typing import Any
 
@@ -74,8 +72,7 @@ def _view_into(_: Any, block: Any, first_byte: Any, shape: Any, dtype: Any) -> A
 
 
 view_into: Any = intrinsic(_view_into)
-"""`view_into(block, first_byte, shape, dtype)`: an array within a block, as a view without an
-owner.
+"""`view_into(block, first_byte, shape, dtype)`: an array within a block, a view without an owner.
 
 The caller holds the block while it uses the view. This costs nothing, while slicing, viewing and
 reshaping are three calls.

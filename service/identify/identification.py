@@ -60,9 +60,7 @@ class Identification(Struct, frozen=True, eq=False, gc=False):
 
     @property
     def explained(self) -> npt.NDArray[np.bool_]:
-        """True for the stars explained by the most likely hypothesis, or else by a unique
-        winner.
-        """
+        """True for stars explained by the most likely hypothesis, or else by a unique winner."""
         return np.asarray((self.star if self.hypothesis is None else self.hypothesis) >= 0)
 
     @property

@@ -36,9 +36,7 @@ from service.vectors import (
 
 POLE_FROM_SUN_WARNING_DEG = 1.0
 SUN_FROM_EARTH_GROWTH_DEG = 0.3
-"""Zone margin in degrees for the Sun seen from Earth's centre, 0.26 deg from its direction at
-L1.
-"""
+"""Zone margin in degrees for the Sun seen from Earth's centre instead of L1, up to 0.26 deg."""
 SAME_BORESIGHT_DEG = 0.01
 PARALLEL_COS = 0.999999
 """Cosine from which two directions are too parallel to define a plane."""
@@ -141,8 +139,7 @@ def _sun_pointed(prior: SunPointedPrior, time: Utc, mission: Mission) -> PriorAt
 
 
 def _frame(first: Vector, second: Vector) -> Matrix:
-    """A right-handed frame as rows: a direction, the normal to it and a second one, and the third
-    axis.
+    """A right-handed frame as rows: a direction, its normal with a second one, the third axis.
 
     A second direction parallel to the first is replaced by a coordinate axis.
     """

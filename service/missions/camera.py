@@ -187,9 +187,7 @@ class Camera(Strict):
         return unit(np.stack([x + bent_x, y + bent_y, np.ones_like(x)], axis=-1))
 
     def places(self, directions: Vector) -> tuple[Vector, Vector]:
-        """Pixel coordinates (u, v) of directions (n, 3); NaN for directions far outside the
-        sensor.
-        """
+        """Pixel coordinates (u, v) of directions (n, 3); NaN for those far outside the sensor."""
         with np.errstate(divide="ignore", invalid="ignore"):
             ahead = directions[..., 2] > 0.0
             true_x = np.where(ahead, directions[..., 0] / directions[..., 2], np.nan)

@@ -14,8 +14,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class IdentifierEntry:
-    """A star identification method: its name, its function, and the properties that the pipeline
-    uses.
+    """A star identification method: name, function, and the properties that the pipeline uses.
 
     `function` takes a `Sighting` and returns an `Identification`; with `by_columns` it takes many
     sightings and writes the results into arrays, as `identify_by_votes` does.
@@ -26,9 +25,7 @@ class IdentifierEntry:
     description: str
     by_columns: bool = False
     weighs_hypotheses: bool = False
-    """True if the method ranks hypotheses by probability, so that two star groups can be told
-    apart.
-    """
+    """True if the method ranks hypotheses by probability, so that two groups can be separated."""
     uses_prior: bool = True
     """True if the method searches about the a priori attitude where one is known."""
     falls_back: bool = False

@@ -83,15 +83,11 @@ class Cap(Strict):
     """The spacecraft's boresight in body axes, which an a priori `boresight` refers to."""
     radius_deg: float = Field(gt=0, le=180)  # CCAP
     grid_deg: GridStep = 0.0
-    """Step in degrees of the grid to which a cached zone's axis is rounded; 0 for the exact
-    zone.
-    """
+    """Step in degrees of the grid for a cached zone's axis; 0 for the exact zone."""
 
 
 class Band(Strict):
-    """A zone of the sky: a band about a small or great circle around the catalog generation
-    vector.
-    """
+    """A zone of the sky: a band about a circle around the catalog generation vector."""
 
     kind: Literal["band"]
     axis_body: Direction
@@ -302,9 +298,7 @@ class Mission(Strict):
     identifier: Identifier = "verified"
     solver: SolverName = "quest"
     lost_in_space_fallback: bool = True
-    """True if the whole sky is searched where `verified` finds no good attitude near the a priori
-    one.
-    """
+    """True if the whole sky is searched where `verified` finds no good attitude in the zone."""
     zone: Annotated[Cap | Band, Field(discriminator="kind")]
     tolerances: Tolerances
     tests: Tests = Field(default=Tests(), validate_default=True)
@@ -395,8 +389,7 @@ class Mission(Strict):
 
     @cached_property
     def presumed_error_deg(self) -> float:
-        """Largest error of the a priori attitude in degrees, about each axis, or of the pole in
-        bands.
+        """Largest a priori attitude error in degrees about each axis, or of the pole in bands.
 
         If `a_priori_error_deg` is missing, the error is the size of the zone minus the field of
         view.
@@ -436,9 +429,7 @@ class Mission(Strict):
 
 
 def parse_mission(text: str, file: str) -> Mission:
-    """A mission read from TOML text; raises `BadConfiguration` naming file, key and allowed
-    values.
-    """
+    """A mission read from TOML text; raises `BadConfiguration` naming file, key and values."""
     try:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:

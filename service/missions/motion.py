@@ -53,9 +53,7 @@ class GyroSettings(Strict):
     bias_sigma_rad_s: float = Field(default=FIRST_BIAS_RAD_S, gt=0, le=1)
     """One sigma of the initial uncertainty of a gyro's bias, rad/s."""
     samples: Literal["mean", "instant"] = "mean"
-    """Meaning of a gyro sample: the mean rate since the previous sample, or the rate at its
-    time.
-    """
+    """Meaning of a gyro sample: the mean rate since the previous one, or the rate at its time."""
     largest_step_s: float | None = Field(default=None, gt=0, le=3600)
     """Longest interval between gyro samples that is no gap; None: 1.5 times the median step."""
 

@@ -150,9 +150,7 @@ class PacketPrior(Strict):
     max_age_s: float = Field(default=10.0, gt=0, le=86400)
     """Largest time difference in seconds between stars and an attitude from another packet."""
     sun_pointed: bool = False
-    """True if, instead of a quaternion, the mission's pole is always at the Sun with unknown
-    roll.
-    """
+    """True if, without a quaternion, the mission's pole is always at the Sun, roll unknown."""
 
     @model_validator(mode="after")
     def _one_source(self) -> Self:

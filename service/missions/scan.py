@@ -133,8 +133,7 @@ Scan = Annotated[CrossScan | Sweep | Raster, Field(discriminator="kind")]
 
 
 class SunTracker(Strict):
-    """A Sun tracker: its alignment with the body, and two signals that measure the Sun's
-    displacement.
+    """A Sun tracker: alignment with the body, and two signals that measure the Sun's displacement.
 
     A pair with the counts I+ and I- gives the signal (I+ - I-) / (I+ + I-). The first pair measures
     the displacement towards the tracker's +X, the second towards +Y.
@@ -150,9 +149,7 @@ class SunTracker(Strict):
     background_counts: float = Field(default=0.0, ge=0, le=1e9)
     """Background counts, subtracted from each detector."""
     noise_counts: float = Field(gt=0, le=1e9)
-    """One standard deviation of a detector's counts; a pair sees the Sun above 5 sigmas of its
-    sum.
-    """
+    """One standard deviation of a detector's counts; a pair sees the Sun above 5 sigmas."""
 
     @model_validator(mode="after")
     def _axes_are_right_handed(self) -> Self:

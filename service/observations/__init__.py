@@ -1,3 +1,1 @@
-"""Observations: batches of observed stars, their file formats, and their conversion to body
-vectors.
-"""
+"""Observations: batches of stars, file formats, and conversion to body vectors."""

@@ -128,8 +128,7 @@ class MeasuredAttitude(Struct, frozen=True, eq=False):
 
 
 class ObservationBatch(Struct, frozen=True, eq=False):
-    """One batch of observations: spacecraft, time, a priori attitude, and the stars of each
-    tracker.
+    """A batch of observations: spacecraft, time, a priori attitude, stars of each tracker.
 
     With a `measurement` there are neither stars nor a priori knowledge. Without `a_priori` a batch
     of stars is lost in space. `tracking` is set for a batch that asks for the last attitude. Body

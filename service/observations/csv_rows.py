@@ -279,9 +279,7 @@ BATCH_ROWS = RowKind(
 
 
 class JoinedRows(ABC):
-    """A collector for the CSV rows of one batch or gyro block; one bad cell refuses all of the
-    rows.
-    """
+    """A collector for the CSV rows of one batch or gyro block; a bad cell refuses all rows."""
 
     key_columns: ClassVar[tuple[str, ...]]
     """The columns that identify a batch or block."""

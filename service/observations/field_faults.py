@@ -16,9 +16,7 @@ Value = TypeVar("Value")
 MAX_FAULTS_SHOWN = 20
 MAX_NAME_SHOWN = 80
 EXPLAINED = 3
-"""Number of errors of a body for which the nearest field name is searched, which takes
-milliseconds.
-"""
+"""Number of errors of a body for which the nearest field name is searched, since that is slow."""
 
 PRIOR_KINDS = {each: each for each in ("quaternion", "boresight", "sun_pointed")} | {
     "from_last": "from"

@@ -96,9 +96,7 @@ def apparent(directions: npt.ArrayLike, velocity_c: Vector, time: Utc) -> Vector
 
 
 def natural(directions: npt.ArrayLike, velocity_c: Vector, time: Utc) -> Vector:
-    """Geometric unit vectors of apparent ones (..., 3): the inverse of `apparent`, within 1e-12
-    rad.
-    """
+    """Geometric unit vectors of apparent ones (..., 3): inverse of `apparent`, to 1e-12 rad."""
     seen = np.asarray(directions, dtype=np.float64)
     found = seen
     for _ in range(_ROUNDS_OF_ABERRATION):

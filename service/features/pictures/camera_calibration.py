@@ -64,9 +64,7 @@ class CameraCalibration:
         return before, after
 
     def sigma(self, number: int) -> float:
-        """One standard deviation of a lens parameter: 0 for log focal length, 1 bend, 2 and 3
-        centre.
-        """
+        """Standard deviation of a lens parameter: 0 for log focal length, 1 bend, 2, 3 centre."""
         return float(math.sqrt(self.covariance[number, number]))
 
 

@@ -43,9 +43,7 @@ LEAST_REFINED = {FREE_SCALE: 4, SCALE_BEND: 6, SCALE_CENTER: 8}
 
 @dataclass(frozen=True)
 class Points:
-    """Points of light in a picture (n), the most likely stars first: places and sigmas in
-    pixels.
-    """
+    """Points of light in a picture (n), likeliest stars first: places and sigmas in pixels."""
 
     u_px: Vector
     v_px: Vector

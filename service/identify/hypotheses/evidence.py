@@ -26,9 +26,7 @@ from service.identify.sighting import PRIOR_DIRECTION, PRIOR_ROTATION
 
 CLUTTER_SPAN_MAG = 6.0
 POSITION_SCALES = np.array([1.0, 2.0, 4.0, 8.0, 16.0])
-"""Factors on the tracker's sigma that are averaged over: 2 to 34 arcsec for the shipped
-trackers.
-"""
+"""Factors on a tracker's sigma, averaged over: 2 to 34 arcsec for the shipped trackers."""
 MAGNITUDE_SCALES_MAG = np.array([0.1, 0.2, 0.4, 0.8, 1.6, 3.2])
 OFFSET_SIGMA_MAG = 0.5
 """Prior sigma of a common offset of the observed magnitudes, if there is one."""
@@ -42,9 +40,7 @@ penalties seven do, while as many real pairs pass.
 TWO_OF_MANY = -2.0
 """Penalty of two-star hypotheses beside unexplained stars, where chance pairs are frequent."""
 ROTATION_SCALES_DEG = np.array([0.05, 0.3, 2.0, 10.0, 45.0])
-"""Scales in degrees of a heavy-tailed prior for the a priori attitude's error, with equal
-weights.
-"""
+"""Scales in degrees of a heavy-tailed prior of the a priori attitude's error, equally likely."""
 TILT_SCALES_DEG = np.array([0.05, 0.2, 1.0, 4.0, 15.0])
 
 _LOG_2PI = math.log(2.0 * math.pi)
@@ -170,9 +166,7 @@ def log_exact_positions(stars, reference_sigma_rad):  # type: ignore[no-untyped-
 
 @njit_no_refcount
 def log_magnitudes(count, total_mag, square_mag2):  # type: ignore[no-untyped-def]
-    """Log evidence of `count` magnitudes, from the sum and sum of squares of observed minus
-    catalog.
-    """
+    """Log evidence of `count` magnitudes, from sum and sum of squares of observed minus catalog."""
     if count == 0:
         return 0.0
     largest = -math.inf

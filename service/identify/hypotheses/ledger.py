@@ -114,9 +114,7 @@ def _smallest(values: Vector, at: int) -> float:
 
 @njit_no_refcount
 def clear(ledger):  # type: ignore[no-untyped-def]
-    """Reset the heaviest hypotheses of an earlier search; the other entries are ignored by
-    count.
-    """
+    """Reset the heaviest hypotheses of an earlier search; others are ignored by count."""
     ledger.heaviest_match[:] = -1
     ledger.heaviest[0] = ledger.heaviest_dropped[0] = -math.inf
 

@@ -32,9 +32,7 @@ FEWEST_MIRRORED = 3
 
 @njit_no_refcount
 def may_be_mirrored(observed, ledger):  # type: ignore[no-untyped-def]
-    """True if the heaviest hypothesis leaves stars unexplained and is weak enough for a mirror
-    test.
-    """
+    """True if the heaviest hypothesis leaves stars unexplained and is weak enough for the test."""
     match = ledger.heaviest_match
     n = len(match)
     matched = 0

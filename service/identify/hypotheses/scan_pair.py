@@ -271,9 +271,7 @@ def _test(scratch, others, at):  # type: ignore[no-untyped-def]
 
 @njit_inlined
 def _missing(voxels, test, u0, u1, u2, v0, v1, v2, w0, w1, w2):  # type: ignore[no-untyped-def]
-    """1 if no star can be at the place predicted by a pair u, v with the cross product w, else
-    0.
-    """
+    """1 if no star can be where a pair u, v with the cross product w predicts one, else 0."""
     alpha, beta, gamma, level = test
     if level < 0:
         return 0

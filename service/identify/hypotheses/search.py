@@ -272,9 +272,7 @@ def weigh_pairs(observed, stars, pairs, scratch, ledger, progress):  # type: ign
 
 @njit_no_refcount
 def _weigh_pair(observed, stars, pairs, pair, scratch, ledger, progress, top):  # type: ignore[no-untyped-def]
-    """Weigh the candidates of one observed pair; returns the progress and the largest log
-    weight.
-    """
+    """Weigh the candidates of one observed pair; returns progress and largest log weight."""
     i, j, kind = pair.i, pair.j, observed.prior_kind
     sine = math.sin(separation_rad(observed.direction[i], observed.direction[j]))
     if sine <= 0.0:

@@ -14,9 +14,7 @@ LARGEST_SIGMA_RAD = math.radians(0.25)
 """Largest sigma of an accepted attitude about its worst axis (a corner cluster gives no roll)."""
 
 LEAST = 1e-300
-"""Lower bound on probabilities relative to the best attitude, since evidence may exceed
-exponents.
-"""
+"""Least probability relative to the best attitude, as evidence may exceed exponents."""
 
 FOUND, TOO_FEW, NOTHING, DOUBTFUL, DEGENERATE = 0, 1, 2, 3, 4
 
@@ -57,8 +55,7 @@ def decide(ledger, count):  # type: ignore[no-untyped-def]
 def star_probabilities(  # type: ignore[no-untyped-def]
     points, index, field, magnitude_gate, t, covariance, match, doubt
 ):
-    """For each point: its most likely star, the probabilities of that and of no star, the second
-    star.
+    """For each point: its most likely star, probabilities of that and of no star, second star.
 
     A point may be its match, the second star near its place, or clutter with the density of the
     unexplained points. `doubt` is the probability that the attitude is wrong, which reduces every

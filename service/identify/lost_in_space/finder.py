@@ -29,8 +29,7 @@ AT_REST = np.zeros(3)
 COLOR_SIGMA_MAG = 0.3
 """Magnitude error beside the noise, from colours and variable stars."""
 FEW_MATCHES, LARGEST_SCATTER_MAG = 4, 1.0
-"""For up to this number of matches made without magnitudes, largest scatter of their magnitude
-offsets.
+"""Up to this number of matches without magnitudes, largest scatter of magnitude offsets.
 
 Otherwise chance gives three random points an attitude in 1 of 15,000 batches. The limit is twice
 the noise of a tracker with poor photometry: half of it would refuse real fields of four stars.
@@ -181,9 +180,7 @@ def _magnitude_offsets(result: LostInSpaceResult, magnitude_mag: Vector, index: 
 def _without_magnitudes(
     corrected: Sequence[CorrectedObservations],
 ) -> tuple[CorrectedObservations, ...]:
-    """Corrected observations of all trackers without magnitudes; trackers may share their
-    offset.
-    """
+    """Corrected observations of all trackers, no magnitudes; trackers may share their offset."""
     return tuple(
         # Read-only, as a batch's arrays are: for writable ones numba would compile every kernel
         # again.

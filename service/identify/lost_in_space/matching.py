@@ -13,9 +13,7 @@ from service.sky.geometry.star_grid import CELL
 from service.sky.whole_sky.index import patch_of
 
 MATCH_GATE = 4.5
-"""Largest distance of a star from a point, in sigmas of the point's noise and the attitude's
-error.
-"""
+"""Largest distance of a star from a point, in sigmas of the point and the attitude."""
 LARGEST_GATE_RAD = 0.006
 ROUNDS = 5
 REJECT_LOG = -4.0
@@ -76,9 +74,7 @@ def nearest_stars(  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def faintest_star(limit_mag, magnitude, gate):  # type: ignore[no-untyped-def]
-    """Faintest star that can match a point; the limit of the pairs where its magnitude is
-    unknown.
-    """
+    """Faintest star that can match a point; the pairs' limit where its magnitude is unknown."""
     return limit_mag if np.isnan(magnitude) else magnitude + gate
 
 

@@ -10,9 +10,7 @@ from service.identify.lost_in_space.predictors import GATE, SLACK_RAD
 from service.sky.whole_sky.index import BRIGHTEST_MAG, BUCKET_RAD, STEP_MAG
 
 LEAST_PAIR_RAD = 0.006
-"""Least separation of a pair of points; a shorter one fixes the rotation about itself too
-poorly.
-"""
+"""Least separation of a pair of points; shorter ones fix a rotation too poorly."""
 TYPICAL_REACH_RAD = 0.07
 """Typical distance of the other points of a field from a pair."""
 CHORD_OF_LONGEST = 0.999

@@ -21,9 +21,7 @@ from service.compiled.jit import njit
 from service.identify.hypotheses.evidence import log_sum
 
 DOUBT = 1e-4
-"""Largest share of the posterior that all other explanations may have beside a reported
-attitude.
-"""
+"""Largest posterior share of all other explanations beside a reported attitude."""
 LOG_NULL = -math.log(20.0)
 """Prior log odds of a field without stars, which is rare."""
 LEAST_EVIDENCE = math.log(1.0 / DOUBT - 1.0) + LOG_NULL
@@ -42,9 +40,7 @@ COUNT_SLOPE = 0.5 * math.log(10.0)
 """Growth of the number of stars per magnitude: the logarithm of 10^0.5."""
 
 MISSING_REACH, MISSING_STEPS = 2.0, 16
-"""Extent of the table of missing stars in sigmas on either side of the limit, and steps per
-sigma.
-"""
+"""Extent of the missing-star table in sigmas on either side of the limit; steps per sigma."""
 FAINT_REACH = 1.0
 """Sigmas by which a star is fainter than the limit from which the search leaves it out."""
 
@@ -65,9 +61,7 @@ _LOG_ROTATIONS = math.log(8.0 * math.pi**2)
 
 @njit(nogil=True)
 def log_positions(matched, log_area_per_spot, chi2, log_det):  # type: ignore[no-untyped-def]
-    """Log evidence of positions and attitude volume; `log_area_per_spot`: sum of ln(A/2 pi
-    sigma^2).
-    """
+    """Log evidence of positions and attitude; `log_area_per_spot`: sum of ln(A/2 pi sigma^2)."""
     most = -math.inf
     for log_weight, log_scale, half in _LOG_SCALES:
         most = max(most, log_weight + (3.0 - 2.0 * matched) * log_scale - half * chi2)
@@ -159,9 +153,7 @@ def log_missing(brighter_by_sigma):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def log_magnitudes(compared, total, square, sigma_mag):  # type: ignore[no-untyped-def]
-    """Log density of observed minus catalog magnitudes, from their number, sum and sum of
-    squares.
-    """
+    """Log density of observed minus catalog magnitudes, from number, sum and sum of squares."""
     if compared == 0:
         return 0.0
     common = OFFSET_SIGMA_MAG * OFFSET_SIGMA_MAG

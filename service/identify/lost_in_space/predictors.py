@@ -14,9 +14,7 @@ GATE = 3.6
 SLACK_RAD = 2e-5
 """Largest change of a separation of 8 degrees by aberration in radians, 4 arcsec."""
 RANK_WEIGHT = 0.04
-"""Relative increase of a point's cost per rank: a faint point is less likely a star of the
-index.
-"""
+"""Relative increase of a point's cost per rank: faint points are less likely index stars."""
 
 
 BEYOND, DEEP_COST = 0.02, 1.5

@@ -40,9 +40,7 @@ from service.identify.lost_in_space.workspace import (
 from service.sky.whole_sky.index import BITMAP_RADII_RAD
 
 FIRST_POINTS = 7
-"""Number of brightest points whose pairs come first in a rich field; later pairs take
-`MOST_POINTS`.
-"""
+"""Number of brightest points whose pairs come first in rich fields; then `MOST_POINTS`."""
 FIRST_TRIES = 3
 """Number of pairs tried by cost alone, before the sets of which every attitude contains a pair."""
 NARROW_GATE, NARROW_MAG = 2.8, 0.75
@@ -50,9 +48,7 @@ NARROW_GATE, NARROW_MAG = 2.8, 0.75
 They miss one in fifty true pairs for half the work. With few points all pairs are repeated in full.
 """
 FEW_POINTS, MOST_FIRST = 6, 4
-"""Number of points up to which a candidate is compared with all others first; beyond, with
-three.
-"""
+"""Number of points up to which candidates are compared with all others first, else with three."""
 PREFILTERED_IN_TURN = 6
 """Number of most informative points among which the three points of the first comparison rotate.
 Later tries rotate among all points, since the bright ones may all be false.
@@ -368,9 +364,7 @@ def weigh(points, index, field, gate_mag, i, j, workspace):  # type: ignore[no-u
 
 @njit(nogil=True)
 def enter(candidate, weight, ledger, count):  # type: ignore[no-untyped-def]
-    """Enter a match in the ledger, replacing the lightest if full; returns the number of
-    entries.
-    """
+    """Enter a match in the ledger, replacing the lightest if full; returns the count."""
     match, weights = candidate.match, ledger.weight
     for h in range(count):
         same = True

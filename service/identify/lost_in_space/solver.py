@@ -58,9 +58,7 @@ class FieldOfView:
 
     radius_deg: float
     half_width_deg: float | None = None
-    """Half the side of a square field whose corners are at `radius_deg`; None for a circular
-    one.
-    """
+    """Half the side of a square field with corners at `radius_deg`; None for a circular one."""
     limit_mag: float = math.nan
     magnitude_sigma_mag: float = 0.5
 
@@ -119,9 +117,7 @@ class LostInSpaceResult(NamedTuple):
 
 
 class StarChances(NamedTuple):
-    """For each point: most likely star (-1: none), its probability, that of no star, second
-    star.
-    """
+    """For each point: likeliest star (-1: none), its probability, that of no star, second star."""
 
     star: Rows
     probability: Vector

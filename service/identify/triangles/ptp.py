@@ -172,9 +172,7 @@ def observed_triangles(direction: Vector, triangles: TriangleIndex) -> tuple[Row
 def scene_of(
     direction: Vector, sigma_rad: Vector, velocity_c: Vector, guide: Guide
 ) -> tuple[ObservedStars, ZoneStars]:
-    """Observed and guide stars in the form that the fit's kernels take, without prior or
-    magnitudes.
-    """
+    """Observed and guide stars in the form of the fit's kernels, without prior or magnitudes."""
     reference_sigma = float(sigma_rad.min()) if len(sigma_rad) else 1.0
     nothing = np.empty(0)
     observed = ObservedStars(

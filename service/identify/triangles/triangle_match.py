@@ -184,8 +184,7 @@ def count_pairs(
 
 @njit(nogil=True)
 def validate(pair_image, pair_star, votes, held, match):  # type: ignore[no-untyped-def]
-    """Choose the catalog row of each observed star by sharing stars, into `match` (n,), -1 for
-    none.
+    """Choose the catalog row of each observed star by sharing stars into `match` (n,), -1 for none.
 
     Pairs are sorted by votes. Among the held pairs of a star that with the most votes counts, and
     none if two are tied; a catalog star likewise goes to the observed star with the most votes for

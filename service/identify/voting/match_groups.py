@@ -1,5 +1,4 @@
-"""Van Bezooijen's match groups: the largest sets of observed stars with mutually consistent
-candidates.
+"""Van Bezooijen's match groups: the largest sets of stars with mutually consistent candidates.
 
 The pairs that survive the tests form a graph: a node is an observed star identified with a zone
 star, an edge a pair that supports both of its identities. A match group is a clique of the graph;

@@ -46,9 +46,7 @@ def identify_by_votes(
 
 
 def refuse_endless(direction: Vector, zone: Zone, rules: Rules) -> None:
-    """Raise `BadBatch` if this many stars (n, 3) at this separation tolerance would take
-    seconds.
-    """
+    """Raise `BadBatch` if as many stars (n, 3) at this separation tolerance would take seconds."""
     n = len(direction)
     if n * (n - 1) // 2 * zone.pairs.count <= MAX_COMPARISONS:
         return

@@ -45,9 +45,7 @@ from service.observations.scans.lines import BREAKDOWN_RATIO, ProfileMoment, mom
 MOST_MOVES = 10
 MOST_SHARE = 0.9
 SLOPE_LEAST = 0.2
-"""Least slope of a moment against the star's place; below it the star is outside the image's
-core.
-"""
+"""Least slope of a moment against the star's place: less means outside the image's core."""
 
 
 def profiles(square: Array, method: str) -> tuple[Array, Array]:

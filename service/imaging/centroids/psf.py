@@ -60,7 +60,7 @@ class GaussianPsf:
         return self._share(du_px) * self._share(dv_px)
 
     def slopes(self, du_px: npt.ArrayLike, dv_px: npt.ArrayLike) -> tuple[Array, Array]:
-        """The derivatives of that share with respect to du and dv; see `Psf`."""
+        """The derivatives of a pixel's share of light with respect to du and dv; see `Psf`."""
         in_u, in_v = self._share(du_px), self._share(dv_px)
         return self._share_slope(du_px) * in_v, in_u * self._share_slope(dv_px)
 
@@ -149,7 +149,7 @@ class SampledPsf:
         return self._at(self._spline, du_px, dv_px)
 
     def slopes(self, du_px: npt.ArrayLike, dv_px: npt.ArrayLike) -> tuple[Array, Array]:
-        """The derivatives of that share with respect to du and dv; see `psf.Psf`."""
+        """The derivatives of a pixel's share of light with respect to du and dv; see `psf.Psf`."""
         along_u, along_v = self._slopes
         return self._at(along_u, du_px, dv_px), self._at(along_v, du_px, dv_px)
 
@@ -210,7 +210,7 @@ class ColouredPsf:
         return (1.0 - self.red_share) * blue + self.red_share * red
 
     def slopes(self, du_px: npt.ArrayLike, dv_px: npt.ArrayLike) -> tuple[Array, Array]:
-        """The derivatives of that share with respect to du and dv; see `Psf`."""
+        """The derivatives of a pixel's share of light with respect to du and dv; see `Psf`."""
         (blue_u, blue_v), (red_u, red_v) = (
             each.slopes(du_px, dv_px) for each in (self.blue, self.red)
         )

@@ -121,9 +121,7 @@ def fit(
 
 
 TYPICAL_RED_SHARE, RED_SHARE_SIGMA = 0.5, 0.4
-"""Mean and sigma of the colours of stars down to V 9, as the share of the red image in a
-mixture.
-"""
+"""Mean and sigma of star colours down to V 9, as the red image's share in a mixture."""
 LEAST_RED_SHARE, MOST_RED_SHARE = -0.2, 1.3
 """Least and largest colours of single stars, as red shares: bluer or redder light is blended."""
 

@@ -179,8 +179,7 @@ def _near(image: TrailImage, du_px: Array, dv_px: Array, reach_px: float) -> Mas
 def fit_trails(
     pixels: TrailPixels, image: TrailImage, u_px: Array, v_px: Array, gain_e_per_count: float
 ) -> TrailPlaces:
-    """Least-squares places and light of stars (n) from their trails, starting at approximate
-    places.
+    """Least-squares places and light of stars (n) from their trails, from approximate places.
 
     The values of `image` are of the shape (n, 1). With an infinite gain the photon noise of the
     stars is left out.

@@ -76,8 +76,7 @@ def stars_behind(
 
 
 def hits_under(window: Window, psf: Psf, star: CentroidRecord) -> Mask:
-    """True for pixels (rows, columns) of a window hit by a cosmic ray, found after a star was
-    located.
+    """True for pixels (rows, columns) of a window hit by a cosmic ray, found beside a fitted star.
 
     The star's model is subtracted; a pixel was hit where its residual exceeds those of its
     neighbours by a factor that no point image reaches.
@@ -145,9 +144,7 @@ def _best(
 
 PATCH_HALF_PX = 3
 SHARP = 0.5
-"""Smallest variance of a star's image along any direction, as a share of that of a point's
-image.
-"""
+"""Least variance of a star's image in any direction, as a share of a point image's."""
 _ROUNDS = 2
 
 

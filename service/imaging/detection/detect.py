@@ -56,8 +56,7 @@ Mask = npt.NDArray[np.bool_]
 def take_background_off(
     light: CountArray, mask: Mask | None, psf_sigma_px: float, step_counts: float = 1.0
 ) -> tuple[CountArray, CountArray]:
-    """Subtract the background from light (rows, columns) in place; returns the level and the noise
-    per pixel.
+    """Subtract the background from light (rows, columns) in place; returns level and noise.
 
     `mask` is True where a pixel holds no number. If images of stars are too wide for a fine mesh,
     only the coarse mesh is subtracted. `step_counts` is the difference of neighbouring counts.
@@ -79,8 +78,7 @@ def take_background_off(
 
 
 def _left(light: CountArray, mask: Mask | None) -> tuple[CountArray, CountArray, float]:
-    """The residual background of each coarse mesh, the noise of each pixel, and the noise of the
-    whole frame.
+    """Residual background of each coarse mesh, noise of each pixel, noise of the whole frame.
 
     Computed from every other pixel.
     """

@@ -101,8 +101,7 @@ def measure(
 
 
 def _neighbours(found: Detections, count: int, reach_px: float) -> list[list[int]]:
-    """For each of the first `count` candidates, the indices of the others whose light falls into
-    its window.
+    """For each of the first `count` candidates, indices of others with light in its window.
 
     Bright stars whose images are already part of the background are not counted.
     """

@@ -33,9 +33,7 @@ MESH_PX = 32
 GUESSED_PSF_PX = 1.2
 """Sigma of a star's image assumed in the first detection, which measures the actual width."""
 LIKE_PSF = 1.35
-"""Largest ratio of an assumed to an actual image width at which a filter loses hardly any
-signal.
-"""
+"""Largest ratio of assumed to actual image width at which a filter loses hardly any signal."""
 LEAST_PSF_PX, MOST_PSF_PX = 0.7, 5.0
 SURROUND = 3.0
 """Width of the subtracted surroundings in the filter, in widths of a star's image."""
@@ -67,8 +65,7 @@ _CENTROID_ROUNDS = 6
 
 @dataclass(frozen=True)
 class PointSources:
-    """Candidates for stars (n) in a picture, the clearest first, and the background-subtracted
-    picture.
+    """Candidates for stars (n) in a picture, clearest first, and the background-subtracted picture.
 
     Places are in pixels of the picture, the centre of its first being (0, 0);
     `covariance_px2` (n, 2, 2) is that of each place along u and v.
@@ -122,8 +119,7 @@ class PointSources:
 def find_points(
     counts: CountArray, threshold: float = FIRST_THRESHOLD, keep_hot: bool = False
 ) -> PointSources:
-    """The candidates for stars on a picture (rows, columns); the width of a star's image is
-    measured first.
+    """The star candidates on a picture (rows, columns); the image width is measured first.
 
     Single bright pixels are hot pixels, not stars, and are left out unless `keep_hot`.
     """

@@ -1,5 +1,4 @@
-"""The images that a camera makes of stars: still, trailed by the body's rates, or with far-reaching
-tails.
+"""Images of stars by a camera: still, trailed by the body's rates, or with long tails.
 
 Stars with far-reaching images, such as diffraction by an aperture, are found one after another. The
 tails of a bright star break into pieces that look like faint stars and hide faint stars. So stars
@@ -142,9 +141,7 @@ def psf_of(
 
 
 STEP_PX = 0.3
-"""Step of a sum of still images along a trail: within a thousandth of the peak of a smooth
-trail.
-"""
+"""Step in the sum of still images along a trail: to a thousandth of a smooth trail's peak."""
 MOST_STEPS = 400
 
 
@@ -170,7 +167,7 @@ class TrailPsf:
         return np.asarray(sum(parts[1:], parts[0]) / len(parts))
 
     def slopes(self, du_px: npt.ArrayLike, dv_px: npt.ArrayLike) -> tuple[Array, Array]:
-        """The derivatives of that share with respect to du and dv; see `Psf`."""
+        """The derivatives of a pixel's share of light with respect to du and dv; see `Psf`."""
         du, dv = np.asarray(du_px, dtype=np.float64), np.asarray(dv_px, dtype=np.float64)
         parts = [self.psf.slopes(du - u, dv - v) for u, v in self._steps()]
         along_u, along_v = (np.stack(each).mean(axis=0) for each in zip(*parts, strict=True))
@@ -230,9 +227,7 @@ A star on a brighter tail is found in the next round.
 SEEN_SHARE = 0.3
 """Least ratio of a candidate's detected light to the fitted light of its star."""
 MOST_IMAGES, MOST_TRIED = 400, 800
-"""Largest numbers of stars subtracted, and of candidates tried in one round: a bound on the
-work.
-"""
+"""Largest numbers of stars subtracted, and of candidates tried in one round, to bound the work."""
 MARGIN_PX = 2
 FAINTEST_DRAWN = 0.01
 """Light of a pixel, in sigmas of noise, below which an image is cut off."""
@@ -404,9 +399,7 @@ class ImageSearch:
 
     @cached_property
     def _rims(self) -> list[tuple[int, float]]:
-        """Half widths of a star's image, each with the largest share of light on the square's
-        rim.
-        """
+        """Half widths of a star's image, with the largest share of light on the square's rim."""
         still, halves = still_psf(self.camera), [reach_px(self.camera)]
         while halves[-1] > 4 * self._half:
             halves.append(halves[-1] // 2)

@@ -1,5 +1,4 @@
-"""Star trails on frames of a calibrated camera: their detection, and the places of stars at mid
-exposure.
+"""Star trails on frames of a calibrated camera: detection, and places at mid exposure.
 
 The images themselves show how the stars moved. If too few images are bright, the body's rates are
 used.
@@ -38,9 +37,7 @@ from service.observations.scans.lines import BREAKDOWN_RATIO
 from service.vectors import Vector
 
 LEAST_FRAME_WIDTHS = 1.4
-"""Least trail length in widths of an image; sigmas of a calibrated camera are not rescaled
-later.
-"""
+"""Least trail length in widths of an image; sigmas of calibrated cameras are not rescaled."""
 PIXEL_VARIANCE = 1.0 / 12.0
 """The variance that a pixel adds to the width of an image, in square pixels."""
 CONTRADICTED_SHARE = 0.3
@@ -126,8 +123,7 @@ def measure_trails(
     faintest_mag: float,
     exposure_s: float,
 ) -> list[MeasuredStar]:
-    """The stars of a frame with trails, measured, the brightest first, in the form that `measure`
-    gives.
+    """The stars of a frame with trails, measured, brightest first, in the form of `measure`.
 
     All methods place a star by the best fit of its trail.
     """

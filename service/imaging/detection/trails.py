@@ -376,8 +376,7 @@ TWIN_REACH_SHARE, TWIN_GATE_PX, TWIN_RATIO = 0.125, 1.0, 1.35
 
 
 def twin_distance_px(u_px: Vector, v_px: Vector, flux: Vector, side_px: int) -> float | None:
-    """The distance in pixels of the two images that every star has; None where stars have single
-    images.
+    """Distance in pixels of the two images that every star has; None for single images.
 
     Stars (n) are given the clearest first. All pairs have the same displacement and ratio of light.
     """

@@ -11,8 +11,7 @@ from service.imaging.frames.frame import bad_frame
 
 
 class BoundedFile(io.RawIOBase):
-    """A binary file whose reads stay between its first and last byte, whatever offset or size is
-    asked for.
+    """A binary file whose reads stay within the file, whatever offset or size is asked for.
 
     An offset beyond the end is no error until bytes are read there, and none are. So an offset of
     2**62 in a header costs nothing, and a read takes no more memory than the file has bytes left.

@@ -1,5 +1,4 @@
-"""EXIF of pictures, read only where it is small: the time, the exposure and the orientation for
-display.
+"""EXIF of pictures, read only if small: time, exposure, and orientation for display.
 
 Pillow turns every number of an EXIF directory into an object, twenty times as large as the number
 in the file.
@@ -32,9 +31,7 @@ _BLOCK_BYTES = 1 << 20
 
 
 class Entry(NamedTuple):
-    """One tag of a TIFF directory, with the bytes (4 or 8) of its value or of the value's
-    offset.
-    """
+    """One tag of a TIFF directory, with the bytes (4 or 8) of its value or value's offset."""
 
     tag: int
     kind: int
@@ -80,8 +77,7 @@ def bytes_beyond(
 
 
 def require_small_exif(file: BoundedFile) -> None:
-    """Raise `BadFile` for a JPEG with too much EXIF, which Pillow would partly read on opening the
-    file.
+    """Raise `BadFile` for a JPEG with too much EXIF, part of which Pillow reads on opening.
 
     One segment has up to 64 KiB; Pillow joins all segments.
     """
@@ -119,8 +115,7 @@ def timing_remarks(time: str | None, exposure_s: float | None) -> list[str]:
 
 
 def exposure_of(image: Any) -> tuple[str | None, float | None]:
-    """The UTC of mid exposure and the exposure in seconds from EXIF, each None where EXIF does not
-    state it.
+    """UTC of mid exposure, and exposure in seconds, from EXIF; each None if missing.
 
     A camera's clock without its offset from UTC gives no time.
     """

@@ -1,5 +1,4 @@
-"""The reader of frames from files: FITS, pictures, raw files and numpy arrays, recognised by first
-bytes.
+"""Reader of frames from files: FITS, pictures, raw files, numpy arrays, by their first bytes.
 
 Files are untrusted. Every reader works on a `BoundedFile`; the size in pixels is read from the
 header and compared with the limits before any decoding. Any fault raises `BadFile` with the reason.

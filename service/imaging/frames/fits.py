@@ -145,9 +145,7 @@ class _Plain:
         self._scaling = _scaling(unit.header)
 
     def plane(self, number: int) -> CountArray:
-        """One plane (rows, columns) of counts of an uncompressed FITS image; planes count from
-        0.
-        """
+        """One plane (rows, columns) of an uncompressed FITS image; planes count from 0."""
         width, height = self._unit.header.image_axes[:2]
         return self._counts(self._read(number * width * height, width * height), (height, width))
 
@@ -228,9 +226,7 @@ def _full_scale(header: fits_header.Header) -> float:
 
 
 def _as_shown(counts: CountArray, header: fits_header.Header) -> tuple[CountArray, str]:
-    """Counts with their rows from the top down, by the keyword ROWORDER, and the change in
-    words.
-    """
+    """Counts with rows from the top down, by the keyword ROWORDER, and the change in words."""
     order = str(header.cards.get("ROWORDER") or "").strip().upper().replace("_", "-")
     if order != "BOTTOM-UP":
         return counts, AS_STORED

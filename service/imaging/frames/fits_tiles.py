@@ -20,13 +20,9 @@ from service.imaging.frames.fits_header import BLOCK, Header, Unit, write_header
 from service.imaging.frames.frame import bad_frame
 
 MAX_TILES = 1 << 16
-"""Largest number of compressed tiles; a decoder takes about 50 microseconds for each, however
-small.
-"""
+"""Largest number of compressed tiles; a decoder takes about 50 microseconds for each."""
 MAX_DEPTH = 3
-"""Largest number of planes in a compressed tile: three colours. A whole tile is decompressed at a
-time.
-"""
+"""Largest number of planes in a compressed tile: three colours, decompressed at once."""
 _SETTINGS = {"BLOCKSIZE": range(1, 1 << 16), "BYTEPIX": (1, 2, 4, 8)}
 _COPIED = re.compile(
     r"(PCOUNT|GCOUNT|TFIELDS|THEAP|BSCALE|BZERO|BLANK|ZIMAGE|Z?(NAXIS|BITPIX)|Z?NAXIS\d+|"

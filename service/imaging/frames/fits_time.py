@@ -393,9 +393,7 @@ class _DateCards:
 
 
 class _LocalTime(Exception):
-    """An error: a keyword holds a local time with an unknown offset from UTC; the message has
-    details.
-    """
+    """An error: a keyword holds a local time with an unknown offset from UTC; see the message."""
 
 
 def _has(header: Header, keys: Iterable[str]) -> bool:

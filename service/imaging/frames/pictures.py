@@ -29,8 +29,7 @@ COLORS = ("RGB", "RGBA", "RGBX", "LA", "P", "PA", "CMYK", "YCbCr")
 
 
 def read_picture(file: BoundedFile, file_format: str, limits: FrameLimits, digest: str) -> Frame:
-    """The frame in a PNG, JPEG, GIF, BMP or PGM file; raises `BadFile` with the reason if it cannot
-    be read.
+    """The frame in a PNG, JPEG, GIF, BMP or PGM file; raises `BadFile` with the reason.
 
     The counts of a colour picture are the sums of red, green and blue.
     """

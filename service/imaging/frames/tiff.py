@@ -1,5 +1,4 @@
-"""Reader of frames from TIFF and BigTIFF files: grey or colour, in any layout of samples, strips
-and tiles.
+"""Reader of frames from TIFF and BigTIFF: grey or colour, any samples, strips and tiles.
 
 tifffile reads the tags and puts strips and tiles in their places. libtiff, in Pillow, decompresses
 them: it writes no more bytes than asked for, whatever a file holds.
@@ -388,9 +387,7 @@ def _planes(file: BoundedFile, order: str, entries: list[Entry], image: Subfile)
 
 
 def _require_small(order: str, entries: list[Entry]) -> None:
-    """Raise `BadFile` for a TIFF directory of too many or too large tags, or with too large
-    tiles.
-    """
+    """Raise `BadFile` for a TIFF directory with too many or too large tags, or too large tiles."""
     if len(entries) > MAX_TAGS:
         raise bad_frame(f"has more than {MAX_TAGS} tags", str(len(entries)))
     tile = 1

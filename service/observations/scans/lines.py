@@ -15,9 +15,7 @@ import numpy.typing as npt
 from service.vectors import Vector
 
 BREAKDOWN_RATIO = 5.0
-"""Least ratio of light to its noise at which a ratio of sums has a usable variance (report,
-7.30).
-"""
+"""Least ratio of light to noise at which a ratio of sums has a usable variance (report, 7.30)."""
 
 
 @dataclass(frozen=True)

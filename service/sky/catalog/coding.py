@@ -49,9 +49,7 @@ class ColumnCoding:
         return np.where(nothing, self.unknown or 0, coded).astype(self.dtype)
 
     def decode(self, stored: Column) -> Column:
-        """Column values from stored integers, to within the step; floating-point columns
-        unchanged.
-        """
+        """Column values from stored integers, within the step; floating-point ones unchanged."""
         if self.step is None:
             return stored.astype(self.dtype)
         if stored.dtype.kind == "f":

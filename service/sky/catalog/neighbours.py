@@ -54,8 +54,7 @@ def _nearest(
     sought: np.typing.NDArray[np.intp],
     fainter_by: float = np.inf,
 ) -> tuple[Vector, Vector]:
-    """Distance in arcsec and magnitude difference of the nearest of the `sought` stars to each
-    star.
+    """Distance in arcsec and magnitude difference of each star's nearest of the `sought` stars.
 
     `own` is each star's row in `others`, which is not its own neighbour.
     """

@@ -54,13 +54,9 @@ class RunCatalog:
     epoch_year: float
     ra_deg: Vector
     dec_deg: Vector
-    """Right ascension and declination, ICRS at the epoch; exported, and the source of
-    `direction`.
-    """
+    """Right ascension and declination, ICRS at the epoch, exported; source of `direction`."""
     motion: Vector
-    """Change of the unit vectors per Julian year (N, 3), radians; flux-weighted for merged
-    stars.
-    """
+    """Change of unit vectors per Julian year (N, 3), radians; flux-weighted for merged stars."""
     parallax_rad: Vector
     """Parallaxes in radians; zero if unknown or negative."""
     magnitude_mag: Vector
@@ -181,8 +177,7 @@ def build_run_catalog(
 
 
 def instrument_magnitude(catalog: Catalog, color_polynomial_mag: Sequence[float]) -> Vector:
-    """Instrument magnitudes V + c0 + c1 (B-V) + c2 (B-V)^2 + … of all stars; V without
-    coefficients.
+    """Instrument magnitudes V + c0 + c1 (B-V) + c2 (B-V)^2 + … of stars; V without coefficients.
 
     A star of unknown colour gets UNKNOWN_COLOR_BV_MAG.
     """
@@ -194,9 +189,7 @@ def instrument_magnitude(catalog: Catalog, color_polynomial_mag: Sequence[float]
 
 
 def export_csv(run_catalog: RunCatalog, path: Path) -> None:
-    """Write a run catalog to CSV, `id,ra_deg,dec_deg,magnitude` in index order, with exact
-    numbers.
-    """
+    """Write a run catalog to CSV, `id,ra_deg,dec_deg,magnitude` in index order, exactly."""
     rows = zip(
         map(neutralised, run_catalog.star_id),
         run_catalog.ra_deg.tolist(),

@@ -63,23 +63,17 @@ class Catalog:
     """Distance of the nearest neighbour at most 2 mag fainter; NaN for none within a degree."""
     rival_fainter_by_mag: Vector
     variability_mag: Vector
-    """Amplitude of variability in magnitudes, from brightest to faintest; NaN if not known to
-    vary.
-    """
+    """Amplitude of variability in magnitudes, brightest to faintest; NaN if not known to vary."""
     position_sigma_arcsec: Vector
     components: npt.NDArray[np.uint8]
     light_elsewhere: npt.NDArray[np.bool_]
-    """True if a neighbour's magnitude includes the star's light, which merging must not add
-    again.
-    """
+    """True if a neighbour's magnitude includes the star's light, which merging must not repeat."""
     hip: npt.NDArray[np.int32]
     tyc: npt.NDArray[np.uint16]
     hd: npt.NDArray[np.int32]
     sao: npt.NDArray[np.int32]
     label: npt.NDArray[np.str_] | None = None
-    """Identifiers of a site's own catalog, e.g. "SKYMAP 1234"; None if stars have HIP or TYC
-    numbers.
-    """
+    """Identifiers of a site's own catalog, e.g. "SKYMAP 1234"; None with HIP or TYC numbers."""
 
     def __len__(self) -> int:
         return len(self.ra_deg)
@@ -188,9 +182,7 @@ def import_sky2000(
 
 
 def import_catalog(path: Path, form: CatalogFormat | None = None) -> Catalog:
-    """A site's own catalog in CSV or SKY2000 format; by default recognised by the file's first
-    bytes.
-    """
+    """A site's own catalog in CSV or SKY2000 format; by default told by the first bytes."""
     if (form or catalog_format(path)) == "sky2000":
         return import_sky2000(path)[0]
     return import_csv(path)

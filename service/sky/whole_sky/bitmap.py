@@ -15,9 +15,7 @@ from service.sky.geometry.directions import axes_across
 from service.vectors import Vector, locked
 
 CELLS = 1632
-"""Cells along an edge of the square, of 3.7 to 11 arcmin: 333 kB, several fit into a processor
-cache.
-"""
+"""Cells along an edge of the square, of 3.7 to 11 arcmin (333 kB: several fit into a cache)."""
 SAMPLE_RAD = 6e-4
 """Spacing of the points that fill a disc, less than the narrowest cell."""
 RIM_RAD, RIM_SAMPLE_RAD = 1.5e-4, 1e-4
@@ -92,9 +90,7 @@ def cells_of_pairs(count, alpha, beta, gamma, pair, cell):  # type: ignore[no-un
 
 @njit(nogil=True, error_model="numpy")
 def cells_of_points(count, coefficients, x, y, cell):  # type: ignore[no-untyped-def]
-    """The cells (count) of many points' predicted places, coefficients (3, count), for one star
-    pair.
-    """
+    """Cells (count) of many points' predicted places, coefficients (3, count), for one pair."""
     x0, x1, x2, y0, y1, y2 = x[0], x[1], x[2], y[0], y[1], y[2]
     z0, z1, z2 = x1 * y2 - x2 * y1, x2 * y0 - x0 * y2, x0 * y1 - x1 * y0
     alpha, beta, gamma = coefficients[0], coefficients[1], coefficients[2]

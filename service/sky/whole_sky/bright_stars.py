@@ -17,9 +17,7 @@ MERGED_ARCSEC = 40.0
 
 @dataclass(frozen=True, eq=False)
 class BrightStars:
-    """Directions (n, 3) of bright stars, ICRS, brightest first, with V magnitude and catalog
-    row.
-    """
+    """Directions (n, 3) of bright stars, ICRS, brightest first, with V and catalog row."""
 
     catalog: Catalog
     year: float

@@ -166,8 +166,7 @@ class SkyIndex:
 
 
 def build_sky_index(run_catalog: RunCatalog, limit_mag: float, radius_deg: float) -> SkyIndex:
-    """Build the index of stars to a limit, for fields of view whose farthest corner is at
-    `radius_deg`.
+    """Index stars to a limit, for fields of view whose farthest corner is at `radius_deg`.
 
     Fainter stars of the run catalog are used for matching only. If there are too many stars, the
     faintest are left out.
