@@ -59,7 +59,7 @@ class _Share(NamedTuple):
     whole_sky: list[str]
     """Names of identifiers that search the whole sky."""
     beside_batches: bool
-    """True if kernels that no batch needs are compiled too: features, pictures."""
+    """True if kernels for other work are compiled too: features, pictures."""
 
 
 class KernelBuild:
@@ -175,7 +175,7 @@ def _is_complete() -> bool:
 
 
 def end_with_parent() -> None:
-    """Ignore, in a child process, the signals that stop the parent, and exit when it has ended."""
+    """In a child process, ignore the signals that stop the parent, and exit after the parent."""
     for each in SIGNALS:
         signal.signal(each, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
@@ -183,7 +183,7 @@ def end_with_parent() -> None:
 
 
 def exit_after_parent() -> None:
-    """Exit, in a child process, when the parent has ended."""
+    """In a child process, exit when the parent has ended."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     threading.Thread(target=_exit_after, args=(parent.sentinel,), daemon=True).start()

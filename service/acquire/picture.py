@@ -64,9 +64,9 @@ LEAST_SIDE_PX = 100
 MIDDLE_SHARES = (1.0 / 3.0, 0.5, 0.25)
 """Parts of a wide picture's sides whose middle is solved alone."""
 CHANGED_TRIALS = 16
-"""Ways in which one picture is changed, at most: parts, mirror images, ranges of focal lengths."""
+"""Largest number of trials with changed versions of one picture: parts, mirrors, focal lengths."""
 LEAST_FAR_SHARE = 0.5
-"""The least share of points with a star far from the middle, over that near the middle."""
+"""Least share of points with a star far from the middle, over that share near the middle."""
 MOST_SIGMA_SHARE = 1.0 / 400.0
 """Largest sigma of an accepted attitude, as a share of the picture's longer side.
 
@@ -123,7 +123,7 @@ class PictureAttitude:
 
     @property
     def lens_attitude(self) -> Matrix:
-        """The attitude (3, 3) whose z is the lens's own axis."""
+        """The attitude (3, 3) whose z is the optical axis of the lens."""
         return np.asarray(_of_the_middle(self.lens, np.eye(3)).T @ self.attitude)
 
     @cached_property
@@ -203,15 +203,15 @@ def solve_picture(
 ) -> PictureResult:
     """Find the attitude and the lens of a picture; `guess_px` is a rough focal length.
 
-    With a `projection` an attitude is one of the whole picture behind such a lens, or there is
-    none; see `_of_fisheye`.
+    With a `projection` the result is for the whole picture with that lens, or without an attitude;
+    see `_of_fisheye`.
 
-    Where what is told leads to nothing all other focal lengths are tried, and where the
-    clear candidates do, so are fainter ones.  Where all of that leads to nothing, the mirror
-    image is tried: a result then is of the mirrored frame, which it holds.  Last, unless
-    `whole_only`, its middle alone and pixels averaged in pairs are tried.  From the middle the
-    lens of the whole is looked for; a result is of the middle or of averaged pixels where none
-    fits.  Raises `BadFile` for a picture without light.
+    If the stated focal length fails, all others are tried, and if the clear candidates fail,
+    fainter ones. If all of that fails, the mirror image is tried; the result then contains the
+    mirrored frame. Last, unless `whole_only`, the middle of the picture alone and pixels averaged
+    in pairs are tried. From the middle the lens of the whole picture is searched; if none fits, the
+    result is that of the middle or of averaged pixels. Raises `BadFile` for a picture without
+    light.
     """
     require_light(frame, math.inf)
     if projection not in (None, "gnomonic"):
@@ -261,7 +261,7 @@ def solve_picture(
 def _solved_part(
     frame: Frame, sky: BrightStars, solver: BlindSolver, guess_px: float | None
 ) -> PictureResult:
-    """The result of a changed picture; `guess_px` is its focal length within a quarter."""
+    """The result for a changed picture; `guess_px` is a focal length known to within a quarter."""
     points = find_points(frame.counts)
     focal = FocalRange.of_fields(max(frame.counts.shape), WIDEST_FIELD_DEG)
     if guess_px is not None:
@@ -276,7 +276,7 @@ def _of_fisheye(
     guess_px: float | None,
     projection: Projection,
 ) -> PictureResult:
-    """The result of a picture through a fisheye whose projection is known, or of its mirror."""
+    """The result for a picture, or its mirror image, through a fisheye of a known projection."""
     points = find_points(frame.counts)
     if points.trailed is not None:
         return _refused_trails(frame, points)
@@ -303,11 +303,12 @@ def _from_middle(
     guess_px: float | None,
     projections: Sequence[Projection],
 ) -> PictureResult | None:
-    """The result of a wide picture, whose middle is like that of a plain lens; None without any.
+    """The result for a wide picture from its middle, which looks like that of a plain lens, or
+    None.
 
-    The middle has the direction and the roll of the whole.  From its attitude, which the evidence
-    must prove by itself, the lens of the whole is looked for.  If none of several projections
-    fits, the result is that of the middle; if the only one does not, there is none.
+    The middle has the direction and the roll of the whole picture. From its attitude, which needs
+    sufficient evidence, the lens of the whole is searched. If none of several projections fits, the
+    result is that of the middle; if a single one does not, there is no result.
     """
     is_told = len(projections) == 1
     for share in (*MIDDLE_SHARES, 1.0) if is_told else MIDDLE_SHARES:
@@ -333,7 +334,7 @@ def _from_middle(
 
 
 def _fits_far_out(found: Verified, places: Points) -> bool:
-    """True if the half of the points that is far from the middle has stars, as the other has."""
+    """True if the outer half of the points has about as many identified stars as the inner half."""
     middle_u, middle_v = _middle(found.fit.lens)
     away = np.hypot(places.u_px - middle_u, places.v_px - middle_v)
     far, has_star = away > np.median(away), found.star >= 0
@@ -341,7 +342,7 @@ def _fits_far_out(found: Verified, places: Points) -> bool:
 
 
 def _middle_of(frame: Frame, share: float) -> Frame:
-    """The middle of a picture, of a share of its sides."""
+    """The middle of a picture, with a given share of its sides."""
     height, width = frame.counts.shape
     down, across = (round(0.5 * (1.0 - share) * side) for side in (height, width))
     return replace(frame, counts=frame.counts[down : height - down, across : width - across])
@@ -355,9 +356,9 @@ def _widened(
     solver: BlindSolver,
     projections: Sequence[Projection],
 ) -> PictureResult | None:
-    """The result of the whole picture from the attitude of its middle; None where none fits.
+    """The result for a whole picture from the attitude of its middle; None if no projection fits.
 
-    Of several projections the one with the most evidence is taken.
+    Of several projections the one with the most evidence is chosen.
     """
     places = places_of(points).first(REFINED_POINTS)
     attitude = _of_the_middle(middle.lens, middle.fit.attitude)
@@ -391,7 +392,7 @@ def _widened(
 
 
 def _averaged(frame: Frame) -> Iterator[tuple[Frame, str]]:
-    """Pictures whose pixels are averaged in pairs, each with a remark that says so."""
+    """Versions of a picture with pixels averaged in pairs, each with a remark on the change."""
     height, width = frame.counts.shape
     for name, counts in (
         ("columns", frame.counts[:, : width // 2 * 2].reshape(height, -1, 2).mean(axis=2)),

@@ -1,4 +1,4 @@
-"""What a user should read about a picture, with or without its attitude."""
+"""Remarks for the user on a picture, with or without an attitude."""
 
 import math
 from collections.abc import Iterator
@@ -17,8 +17,9 @@ if TYPE_CHECKING:
     from service.acquire.picture import PictureResult
 
 CLEAR_RATIO, LEAST_CLEAR = 12.0, 25
-"""Signal to noise of clear points, and how many of them without an attitude speak for a lens or
-pixels of another kind."""
+"""Least signal to noise of clear points, and their number, from which a failed solution suggests an
+unusual lens or pixels.
+"""
 
 CLIPPED_SHARE = 0.5
 BLURRED_PX = 3.5
@@ -27,13 +28,13 @@ NOTABLE_HOT = 20
 NOTABLE_BEND = 0.003
 NOTABLE_FOCAL = 0.005
 MOST_OFF_MAG = 1.5
-"""The change of a camera's zero point that clouds and another aperture explain."""
+"""Largest change of a camera's zero point that clouds or another aperture explain, in mag."""
 
 
 def remarks_on(
     lens: Lens, found: Verified, points: PointSources, guess_px: float | None, guess_share: float
 ) -> Iterator[str]:
-    """Remarks that a user should read about a picture whose attitude was found."""
+    """Remarks for the user on a picture whose attitude was found."""
     fitted_px = lens.focal_px
     if guess_px is not None:
         off = fitted_px / guess_px - 1.0
@@ -118,7 +119,7 @@ def remarks_on_light(points: PointSources, dark: bool) -> Iterator[str]:
 
 
 def doubt_of_exposure(result: "PictureResult", zero_point_mag: float | None) -> list[str]:
-    """A remark where the zero point of a picture is far from that of its camera."""
+    """A remark if the zero point of a picture is far from that of its camera."""
     found = result.attitude
     if found is None or zero_point_mag is None or not math.isfinite(found.zero_point_mag):
         return []

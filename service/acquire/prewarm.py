@@ -135,7 +135,7 @@ def prewarm_kernels(
 
 
 def compile_beside_batches() -> None:
-    """Load the kernels, or compile them, of features and of pictures."""
+    """Load or compile the kernels of features and of pictures."""
     for module in feature_modules("kernels", os.environ.get(SETTING, "")):
         module.compile_kernels()
     compile_walk()

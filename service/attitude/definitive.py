@@ -1,9 +1,10 @@
-"""The definitive attitude as it is recorded: filtered and smoothed samples of a UTC day.
+"""The definitive attitude as recorded: filtered and smoothed samples of a UTC day.
 
-An innovation is the rotation from the filter's prediction to a measured attitude.  A difference
-is that from the smoothed attitude to the measurement: the smoother has used it, so their errors
-are correlated, and the covariance of the difference is R - P; of a measurement that was not used
-it is R + P.  The page of the definitive attitude shows both, and noise is estimated from them.
+An innovation is the rotation from the filter's prediction to a measured attitude. A difference is
+the rotation from the smoothed attitude to the measurement. The smoother has used the measurement,
+so that their errors are correlated and the covariance of the difference is R - P; for an unused
+measurement it is R + P. The page of the definitive attitude shows both, and noise is estimated from
+them.
 """
 
 import zlib
@@ -25,7 +26,7 @@ GRADES: tuple[Grade, ...] = ("filtered", "smoothed")
 
 
 class Status(IntEnum):
-    """The quality of an attitude in the history.
+    """The quality of a definitive attitude.
 
     NONE: no attitude was measured yet.  STARTING: started, and not yet confirmed by
     further measurements.  GOOD.  DOUBTFUL: the last measurements contradict the

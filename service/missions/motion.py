@@ -162,7 +162,7 @@ class LiveFilterSettings(Strict):
 
 
 class SmoothingSettings(Strict):
-    """Settings for the automatic smoothing of the attitude history."""
+    """Settings for the automatic smoothing of the definitive attitude."""
 
     daily: bool = False
     """True if each UTC day of live data is smoothed, two hours and ten minutes after its end."""

@@ -1,10 +1,9 @@
-"""A lens fitted to stars whose directions are known: focal length, centre, radial distortion.
+"""A least-squares fit of a lens to identified stars: focal length, centre, radial distortion.
 
 A plain lens projects the sky on a plane (gnomonic), a fisheye in one of three other ways.
 
-The error of a star's place averages down with the number of stars.  That of the model of
-the lens, of the catalog's epoch or of refraction does not: neighbours share it
-(`shared_variance_px2`).
+The error of a star's place averages down with the number of stars. The errors of the lens model, of
+the catalog's epoch and of refraction do not: neighbouring stars share them (`shared_variance_px2`).
 """
 
 import math
@@ -30,14 +29,16 @@ NEIGHBOURS = 3
 """Number of neighbours whose residuals estimate the correlated error of a star."""
 LEAST_RESIDUAL_PX = 0.05
 WIDEST_RAD = 2.1
-"""No lens shows what is farther from its axis."""
+"""Largest angle from a lens's optical axis, in radians, at which a picture can show a star."""
 PROJECTIONS: tuple[Projection, ...] = get_args(Projection)
 _NEAR_AXIS = 1e-3
 """Sine of the angle from the axis below which an equidistant lens is expanded in a series."""
 
 
 def distance_of(projection: Projection, angle_rad: float) -> float:
-    """The distance from the axis, in focal lengths, of what is at an angle from it."""
+    """The distance from the optical axis, in focal lengths, of a point at an angle from the
+    axis.
+    """
     return {
         "gnomonic": math.tan(angle_rad),
         "equidistant": angle_rad,
@@ -47,7 +48,7 @@ def distance_of(projection: Projection, angle_rad: float) -> float:
 
 
 def _angle_of(projection: Projection, distance: Vector) -> Vector:
-    """The angles from the axis of what is at distances, in focal lengths, from it."""
+    """The angles from the optical axis of points at distances, in focal lengths, from the axis."""
     if projection == "gnomonic":
         return np.arctan(distance)
     if projection == "equidistant":
@@ -58,9 +59,10 @@ def _angle_of(projection: Projection, distance: Vector) -> Vector:
 
 
 def _stretch_of(projection: Projection, body: Vector) -> tuple[Vector, Vector]:
-    """The distances of directions (n, 3) over the sines of their angles, and the slope by z.
+    """The ratio of image distance to the sine of the angle for directions (n, 3), and its slope by
+    z.
 
-    Of a fisheye; both are infinite opposite to its axis.
+    It applies to a fisheye; both are infinite opposite to the optical axis.
     """
     z = body[:, 2]
     if projection == "equisolid":
@@ -77,12 +79,12 @@ def _stretch_of(projection: Projection, body: Vector) -> tuple[Vector, Vector]:
 
 @dataclass(frozen=True)
 class Lens:
-    """A camera of a focal length, an optical axis off the middle, and a radial distortion.
+    """A camera lens: focal length, offset of the optical axis, radial distortion, projection.
 
     `bend` is the radial displacement at the half diagonal `radius_px`, as a share of the radius:
-    the true distance from the axis is r (1 + bend (r / radius_px)^2).  `off_u` and
-    `off_v` are those of the axis from the middle, in units of `radius_px`.  Near the axis the focal
-    length is that of a plain lens, whatever the projection.
+    the true distance from the axis is r (1 + bend (r / radius_px)^2). `off_u` and `off_v` are the
+    offsets of the axis from the middle, in units of `radius_px`. Near the axis every projection is
+    like a plain lens of that focal length.
     """
 
     width_px: int
@@ -107,7 +109,7 @@ class Lens:
         )
 
     def plane(self, u_px: Vector, v_px: Vector) -> Vector:
-        """True coordinates (n, 2) in the projection, in focal lengths."""
+        """Undistorted coordinates (n, 2) of pixels in the lens's projection, in focal lengths."""
         center_u, center_v = self.center_px
         x, y = np.asarray(u_px) - center_u, np.asarray(v_px) - center_v
         scale = (1.0 + self.bend * (x * x + y * y) / self.radius_px**2) / self.focal_px
@@ -126,14 +128,14 @@ class Lens:
 
     @property
     def reach_rad(self) -> float:
-        """The angle of the corners from the axis."""
+        """The angle in radians of the picture's corners from the optical axis."""
         distance = self.radius_px / self.focal_px * (1.0 + abs(self.bend))
         if self.projection == "gnomonic":
             return math.atan(distance)
         return min(float(_angle_of(self.projection, np.array(distance))), WIDEST_RAD)
 
     def projected(self, body: Vector) -> Vector:
-        """Coordinates (n, 2) in the projection, in focal lengths, of unit vectors (n, 3)."""
+        """Projected coordinates (n, 2), in focal lengths, of unit vectors (n, 3) in camera axes."""
         if self.projection == "gnomonic":
             return np.asarray(body[:, :2] / body[:, 2:])
         return np.asarray(body[:, :2] * _stretch_of(self.projection, body)[0][:, None])
@@ -225,7 +227,7 @@ def lens_of(lens: Lens, names: tuple[str, ...], free: Vector) -> Lens:
 
 
 def _residual(lens: Lens, attitude: Matrix, u_px: Vector, v_px: Vector, star: Vector) -> Vector:
-    """Observed minus predicted (2 n,), in pixels of the undistorted projection."""
+    """Observed minus predicted coordinates (2 n,), in pixels of the undistorted projection."""
     predicted = lens.projected(star @ attitude.T)
     return np.asarray(((lens.plane(u_px, v_px) - predicted) * lens.focal_px).ravel())
 

@@ -78,7 +78,7 @@ def focal_px_of(side_px: int, field_deg: float, projection: Projection = "gnomon
 
 
 def least_log_odds(trials: int) -> float:
-    """The evidence above which an attitude is accepted that is the best of so many trials."""
+    """Least log odds of an accepted attitude that is the best of several trials."""
     return ACCEPT_LOG_ODDS + math.log(trials)
 
 
@@ -121,10 +121,10 @@ class BlindSolver:
         return self._levels[radius_deg]
 
     def solve(self, points: Points, focal: FocalRange, trials: int = 1) -> BlindResult:
-        """The attitude and lens with the most evidence.
+        """The attitude and lens with the most evidence for a picture's points.
 
-        Where it is one of several `trials` to explain one picture, it needs as many times the
-        odds of a single one.
+        If it is one of several `trials` to explain one picture, it needs as many times the odds of
+        a single trial.
         """
         search = _Search(self, points, focal)
         best: Verified | None = None
