@@ -31,7 +31,7 @@ from service.observations.decompress import MAX_LINE_BYTES
 from service.times import parse_utc
 
 _LOOKED_AT_BYTES = 2048
-_COMMENTS = re.compile(rb"\A(COMMENT( [^\n]*)?\r?\n\s*)+(?=CCSDS_)")
+_COMMENTS = re.compile(rb"\A(COMMENT([ \t][^\n]*)?\r?\n\s*)+(?=CCSDS_)")
 _IS_ACM = re.compile(rb"<(\w+:)?acm\b|\ACCSDS_ACM_VERS")
 
 READ = (

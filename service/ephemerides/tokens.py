@@ -139,7 +139,7 @@ def _kvn(source: Source, file: IO[bytes], form: MessageForm) -> Iterator[Token]:
     while data := file.readline(MAX_LINE_BYTES + 1):
         number += 1
         line = _text(source, number, data)
-        if not line or line == "COMMENT" or line.startswith("COMMENT "):
+        if not line or line.partition(" ")[0].partition("\t")[0] == "COMMENT":
             continue
         if line in form.marks:
             inside_data = line in form.before_states

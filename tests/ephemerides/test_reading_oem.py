@@ -254,7 +254,7 @@ def test_tabs_orders_of_keywords_and_comments_of_several_lines_change_nothing():
     metadata, _, states = rest.partition("META_STOP\n")
     lines = metadata.replace(" = ", "\t=\t").splitlines()[::-1]
     metadata = "".join(f"\t{line}\n" for line in lines)
-    comments = "COMMENT made by hand, 1996NOV 04. It is\nCOMMENT to be used = for tests only.\n"
+    comments = "COMMENT made by hand, 1996NOV 04. It is\nCOMMENT\tto be used = for tests only.\n"
     states = states.replace(" ", "\t").replace("COMMENT\tstates\n", comments)
     other = f"\ufeff{head}META_START\n{metadata}META_STOP\n{comments}{states}"
     np.testing.assert_array_equal(at(read(other), [70.0]), at(read(text), [70.0]))

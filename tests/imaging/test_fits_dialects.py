@@ -66,6 +66,21 @@ TIMES = {
     "the average": ({"DATE-AVG": NOON, "EXPTIME": 4.0}, {}, 0.0),
     "MJD-OBS": ({"MJD-OBS": 61100.5, "EXPTIME": 4.0}, {}, 2.0),
     "MJD-AVG": ({"MJD-AVG": 61100.5}, {}, 0.0),
+    "a whole date and its time of day": (
+        {"DATE-OBS": NOON, "TIME-OBS": "12:00:01", "UT": ("04:00:00", "written"), "EXPTIME": 2.0},
+        {},
+        1.0,
+    ),
+    "a local date and its time of day": (
+        {
+            "DATE-OBS": ("2026-03-01T21:00:00", "local time"),
+            "TIME-OBS": "21:00:00",
+            "UTCOFFS": 9,
+            "EXPTIME": 2.0,
+        },
+        {},
+        1.0,
+    ),
     "a date with TIME-OBS": (
         {"DATE-OBS": "2026-03-01", "TIME-OBS": "12:00:00.5", "EXPTIME": 1.0},
         {},
@@ -161,6 +176,14 @@ NO_TIMES = {
     "average outside": (
         {"DATE-AVG": NOON, "DATE-BEG": "2026-03-01T12:30:00", "EXPTIME": 1.0},
         "not between",
+    ),
+    "a time of day on another day": (
+        {"DATE-OBS": NOON, "TIME-OBS": "2026-02-28T12:00:00", "EXPTIME": 2.0},
+        "DATE-OBS is 2026-03-01T12:00:00, and TIME-OBS 2026-02-28T12:00:00",
+    ),
+    "midnight for a date": (
+        {"DATE-OBS": "2026-03-01T00:00:00", "UT": "05:04:58.4", "EXPTIME": 2.0},
+        "DATE-OBS is 2026-03-01T00:00:00, and UT 05:04:58.4",
     ),
     "average behind start and exposure": (
         # A program may write the computer's clock into one, and the camera's into the other.
@@ -382,3 +405,10 @@ def test_a_header_moves_no_terminal_s_cursor(values):
         read(with_card(written(fits.PrimaryHDU(values.astype("f4"))), card))
     assert str(caught.value).isprintable()
     assert r"\x1b[31m\x07" in str(caught.value)
+
+
+def test_a_blank_that_the_pixels_cannot_hold_marks_none_of_them(values):
+    counts = read(
+        written(image(values.astype("i4"), {"BLANK": -(1 << 63)}, fits.PrimaryHDU))
+    ).counts
+    assert np.array_equal(counts, values)

@@ -169,7 +169,8 @@ class _Plain:
                 counts = counts.astype(np.float64)
             counts = (counts * scale + zero).astype(counts.dtype, copy=False)
         if self._kind.kind in "iu" and "BLANK" in header.cards:
-            counts[stored == header.whole("BLANK", least=-(1 << 40))] = np.nan
+            # One that the pixels cannot hold marks none of them.
+            counts[stored == header.whole("BLANK", least=-(1 << 63))] = np.nan
         return counts.reshape(shape)
 
 

@@ -237,6 +237,8 @@ class _DateCards:
         starts = self._moments(key for key in STARTS if roles.get(key, "start") == "start")
         ends = self._moments((*ENDS, *meant["end"]))
         middle, start, end = _agreed(averages), _agreed(starts), _agreed(ends)
+        if "DATE-OBS" in starts:
+            self._require_same_clock()
         lasted_s = None if start is None or end is None else _seconds_between(start, end)
         if lasted_s is not None and not -0.001 <= lasted_s <= LONGEST_EXPOSURE_S:
             raise _NoTime(f"start and end of the exposure lie {lasted_s:.3f} s apart")
@@ -265,6 +267,30 @@ class _DateCards:
         if end is not None and exposure_s is not None:
             return shifted(end, -0.5 * exposure_s), f"{ended} and {lasted}"
         raise _NoTime(self._missing(start or end))
+
+    def _require_same_clock(self) -> None:
+        """Raise `_NoTime` if a time of day beside a whole date lies outside the exposure.
+
+        Some writers give the day, or midnight, in the date and the time of day in its own card.
+        """
+        date, cards = self.header.cards.get("DATE-OBS"), self.header.cards
+        zone = _CLOCK.search(date) if isinstance(date, str) else None
+        if not isinstance(date, str) or zone is None or zone[5] not in (None, "Z"):
+            return
+        scale = self._scale("DATE-OBS")
+        start = _read(date.strip(), None, scale)
+        for key in TIMES_OF_DAY:
+            clock, comment = cards.get(key), self.header.comments.get(key, "")
+            said_otherwise = _LOCAL.search(comment) or _OTHER_MOMENTS.search(comment.lower())
+            if not isinstance(clock, str) or said_otherwise:
+                continue
+            clock = clock.strip()
+            other = _read(clock, None, scale) or _read(date.strip()[:10], clock, scale)
+            if start is None or other is None:
+                continue
+            late_s = _seconds_between(start, other)
+            if not -SAME_S <= late_s <= (self.exposure.seconds or 0.0) + SAME_S:
+                raise _NoTime(f"DATE-OBS is {date.strip()[:30]}, and {key} {clock[:30]}")
 
     def _missing(self, moment: Utc | None) -> str:
         problems = "".join(f"; {each}" for each in (*self.problems, self.exposure.problem) if each)

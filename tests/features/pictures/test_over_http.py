@@ -155,6 +155,60 @@ def test_every_format_is_read_by_every_way(client, send, frames, tmp_path, capsy
         assert np.degrees(np.arccos(min(boresight @ found, 1.0))) < 0.05
 
 
+TIMES = {
+    "an exposure in milliseconds": (
+        {
+            "DATE-OBS": ("2026-03-01T00:00:00", "start of the exposure"),
+            "EXPTIME": (500, "exposure time in milliseconds"),
+        },
+        ("2026-03-01T00:00:00.250Z", 0.5),
+    ),
+    "local time": (
+        {
+            "DATE-OBS": ("2026-03-01T09:00:00", "Local time of start of exposure"),
+            "UTCOFFS": 9,
+            "EXPTIME": 0.5,
+        },
+        ("2026-03-01T00:00:00.250Z", 0.5),
+    ),
+    "local time of an unknown place": (
+        {"DATE-OBS": ("2026-03-01T09:00:00", "Local time"), "EXPTIME": 0.5},
+        (None, 0.5),
+    ),
+}
+
+
+@pytest.mark.parametrize("case", TIMES)
+def test_the_comments_of_a_header_count_over_http_too(client, send, frames, case):
+    cards, (time, exposure_s) = TIMES[case]
+    unit = fits.PrimaryHDU(frames[0].counts)
+    for key, value in cards.items():
+        unit.header[key] = value
+    file = io.BytesIO()
+    unit.writeto(file)
+    told = client.post("/api/v1/pictures", content=file.getvalue(), headers=OCTETS).json()
+    assert (told["time"], told["exposure_s"]) == (time, exposure_s)
+    recorded = send(file.getvalue(), {"batch": case.replace(" ", "-"), "a_priori": None})
+    if time is None:
+        assert recorded.status_code == 422
+        assert recorded.json()["errors"][0]["field"] == "time"
+    else:
+        assert recorded.status_code == 201, recorded.text
+        answer = recorded.json()
+        assert (answer["time"], answer["frame"]["exposure_s"]) == (time, exposure_s)
+
+
+def test_a_projection_is_told_by_its_name(client):
+    asked = {"lens": "equidistant", "field_of_view_deg": "11"}
+    content = PLEIADES.read_bytes()
+    found = client.post("/api/v1/pictures", params=asked, content=content, headers=OCTETS).json()
+    assert found["lens"]["projection"] == "equidistant"
+    assert "Alcyone" in [star["name"] for star in found["stars"]]
+    refused = client.post("/api/v1/pictures?lens=wide", content=content, headers=OCTETS)
+    assert refused.status_code == 422
+    assert "equisolid" in refused.text
+
+
 ABSURD = absurd_files(np.random.default_rng(4))
 
 

@@ -5,6 +5,7 @@ import dataclasses
 import html
 import io
 import json
+import math
 import re
 import threading
 
@@ -299,6 +300,33 @@ def test_the_attitude_at_a_moment_is_that_of_the_series(client, full_run):
     assert found["ids"] == [first["id"]]
     assert found["quaternion"] == first["quaternion"]
     assert (found["offset_s"], found["motion_arcsec"]) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("rate_deg_per_s", [0.5, 24.0])
+def test_between_batches_a_body_is_turned_by_the_rates_that_they_carry(client, run, rate_deg_per_s):
+    """Twenty-four degrees a second, a batch every ten seconds: the shorter way is the wrong one."""
+    for k in range(4):
+        half = math.radians(10.0 * k * rate_deg_per_s) / 2.0
+        quaternion = [0.0, 0.0, math.sin(half), math.cos(half)]
+        answer = client.post(
+            "/api/v1/batches",
+            json={
+                "spacecraft": "XTE",
+                "run": run,
+                "batch": f"{run}-{k}",
+                "time": f"1999-03-02T00:00:{10 * k:02d}Z",
+                "a_priori": None,
+                "body_rates_deg_per_s": [0.0, 0.0, rate_deg_per_s],
+                "measurement": {"quaternion": quaternion, "sigma_arcsec": [5.0, 5.0, 5.0]},
+            },
+        )
+        assert answer.status_code == 201, answer.text
+    for seconds in (5, 12, 25):
+        asked = {"run": run, "time": f"1999-03-02T00:00:{seconds:02d}Z"}
+        found = client.get(f"{ROUTE}/at", params=asked).json()
+        turned_deg = 2.0 * math.degrees(math.atan2(*found["quaternion"][2:]))
+        off_deg = (turned_deg - rate_deg_per_s * seconds + 180.0) % 360.0 - 180.0
+        assert abs(off_deg) < 1e-6
 
 
 def test_a_moment_outside_every_stretch_is_not_found(client, full_run):
