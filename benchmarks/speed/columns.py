@@ -22,13 +22,14 @@ from benchmarks.bounds import Bound, at_least, at_most, equal
 from benchmarks.report import Report
 from benchmarks.speed.pipeline import MEGABYTES_256
 from service.acquire import Acquisition, BatchColumns, acquire, acquire_many
-from service.missions.mission import SHIPPED_FOLDER, load_missions
+from service.missions.mission import load_missions
 from service.observations.batch import ObservationBatch
 from service.observations.schema import submission_from_json
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
 from service.storage.recording.answer import answer_of
+from tests.missions.stated_files import STATED_FOLDER
 from tests.reference import batches
 from tests.reference.compare import Judge
 
@@ -102,7 +103,7 @@ def measured(
 
 def nominal(name: str, count: int, seed: int, sky: SkyModel) -> list[ObservationBatch]:
     """Batches of five real stars about one slightly wrong a priori attitude."""
-    toml = tomllib.loads((SHIPPED_FOLDER / f"{name.lower()}.toml").read_text("utf-8"))
+    toml = tomllib.loads((STATED_FOLDER / f"{name.lower()}.toml").read_text("utf-8"))
     judge, rng, moment = Judge(toml, sky), np.random.default_rng(seed), batches.TIMES[1]
     attitude = batches.prior_attitudes(rng, toml, 3)[2]
     bodies = [

@@ -24,12 +24,13 @@ from service.acquire import acquire
 from service.acquire.prewarm import prewarm_kernels
 from service.compiled.jit import njit
 from service.missions.identifiers import IDENTIFIERS
-from service.missions.mission import SHIPPED_FOLDER, load_missions
+from service.missions.mission import load_missions
 from service.observations.batch import ObservationBatch
 from service.observations.schema import submission_from_json
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
+from tests.missions.stated_files import STATED_FOLDER
 from tests.reference import batches
 from tests.reference.compare import Judge, zone_searched
 
@@ -89,7 +90,7 @@ def measured(
 ) -> Place:
     """Figures of one place: nominal batches of five stars about one a priori attitude."""
     mission_name, place = PLACES[name]
-    toml = tomllib.loads((SHIPPED_FOLDER / f"{mission_name.lower()}.toml").read_text("utf-8"))
+    toml = tomllib.loads((STATED_FOLDER / f"{mission_name.lower()}.toml").read_text("utf-8"))
     judge = Judge(toml, sky)
     kind = toml["zone"]["kind"]
     attitudes = batches.prior_attitudes(rng, toml, 3)

@@ -15,10 +15,10 @@ from tqdm import tqdm
 from benchmarks.bounds import Bound, at_least, equal, every
 from benchmarks.report import Report
 from benchmarks.sections import Section, Written, table
-from service.missions.mission import SHIPPED_FOLDER
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
+from tests.missions.stated_files import STATED_FOLDER
 from tests.reference.batches import with_trackers
 from tests.reference.compare import Judge
 
@@ -33,7 +33,7 @@ def run(quick: bool, seed: int) -> Report:
     count = QUICK_BATCHES if quick else BATCHES
     sky = SkyModel(load_embedded(), LruCache(256 << 20))
     shipped = [
-        tomllib.loads(path.read_text("utf-8")) for path in sorted(SHIPPED_FOLDER.glob("*.toml"))
+        tomllib.loads(path.read_text("utf-8")) for path in sorted(STATED_FOLDER.glob("*.toml"))
     ]
     jobs = [(toml["name"], toml, count) for toml in shipped]
     jobs += [
