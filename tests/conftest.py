@@ -196,9 +196,14 @@ def _left_out(config):
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_sessionfinish(session):
-    """A worker of pytest-xdist tells what it left out; all of them leave out the same."""
+    """A worker of pytest-xdist tells what it left out; all of them leave out the same.
+
+    The whole run fails where a kernel was compiled for a second kind of arguments.
+    """
     if hasattr(session.config, "workeroutput"):
         session.config.workeroutput["left_out"] = session.config.stash.get(LEFT_OUT, {})
+    elif kernels_compiled_twice() and session.exitstatus == pytest.ExitCode.OK:
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
 
 @pytest.hookimpl(optionalhook=True)

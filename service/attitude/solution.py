@@ -100,8 +100,9 @@ def solve_attitude(
     if n < 2:
         return NoAttitude.FEWER_THAN_TWO_UNIQUE_STARS
     workspace = fit_workspace(n)
-    chosen = METHODS.index(method)
-    if not fit_attitude(observed, reference, sigma_rad, WORST_AXIS_RAD, chosen, workspace):
+    # Of the kind of array that the kernel is compiled for, whatever the caller's are.
+    vectors = (np.array(each, order="C") for each in (observed, reference, sigma_rad))
+    if not fit_attitude(*vectors, WORST_AXIS_RAD, METHODS.index(method), workspace):
         return NoAttitude.DEGENERATE_GEOMETRY
     solution = solution_of(workspace, n, method)
     if len(trackers) > 1:
@@ -212,7 +213,7 @@ def _outlier(
         n = int(rest.sum())
         tail = 0.0
         if n > 1:
-            parts = observed[rest], reference[rest], sigma_rad[rest]
+            parts = (np.array(each[rest], order="C") for each in (observed, reference, sigma_rad))
             workspace = fit_workspace(n)
             solved = fit_attitude(*parts, WORST_AXIS_RAD, QUEST, workspace)
             tail = float(chdtrc(2 * n - 3, workspace.figures[TASTE])) if solved else 0.0

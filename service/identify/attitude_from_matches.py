@@ -18,7 +18,7 @@ from service.attitude.solution import (
 )
 from service.compiled.jit import njit, njit_no_refcount
 from service.identify.identification import Integers
-from service.vectors import Vector
+from service.vectors import Vector, locked
 
 SUN_SCHWARZSCHILD_AU = 1.97412574336e-8
 """The Sun's gravitational radius in au, with ERFA's value."""
@@ -153,7 +153,7 @@ def fit_sightings(  # type: ignore[no-untyped-def]
     """
     for i in which:
         first, last = offsets[i], offsets[i + 1]
-        observed, reference, sigma = matched_vectors(
+        observed, reference, sigma = _matched_vectors(
             direction_body[first:last],
             sigma_rad[first:last],
             star[first:last],
@@ -182,16 +182,33 @@ def fit_sightings(  # type: ignore[no-untyped-def]
                 at += 1
 
 
-@njit(error_model="numpy")
-def matched_vectors(  # type: ignore[no-untyped-def]
-    direction_body, sigma_rad, star, catalog_direction, velocity, sun_distance_au
-):
+def matched_vectors(
+    direction_body: Vector,
+    sigma_rad: Vector,
+    star: Integers,
+    catalog_direction: Vector,
+    velocity_c: Vector,
+    sun_distance_au: float,
+) -> tuple[Vector, Vector, Vector]:
     """Body vectors (N, 3), inertial reference vectors (N, 3) and sigmas (N,) of identified stars.
 
     `star` (n,) holds rows of the run catalog, -1 for stars without one.  The
-    references are apparent as a moving observer sees them; a `velocity` of zero
+    references are apparent as a moving observer sees them; a `velocity_c` of zero
     (units of c) leaves them geometric.
     """
+    # Of the kinds of array that `fit_sightings` has.
+    stars = (np.array(each, order="C") for each in (direction_body, sigma_rad, star))
+    found: tuple[Vector, Vector, Vector] = _matched_vectors(
+        *(*stars, locked(catalog_direction), np.array(velocity_c), sun_distance_au)
+    )
+    return found
+
+
+@njit(error_model="numpy")
+def _matched_vectors(  # type: ignore[no-untyped-def]
+    direction_body, sigma_rad, star, catalog_direction, velocity, sun_distance_au
+):
+    """`matched_vectors`, compiled."""
     count = 0
     for k in range(len(star)):
         if star[k] >= 0:

@@ -126,7 +126,7 @@ def test_what_batches_with_a_zone_need_is_compiled_without_the_whole_sky(
 SELDOM = """
 from service.acquire.prewarm import prewarm_kernels
 from service.attitude.kernels import fit_attitude
-from service.identify.attitude_from_matches import matched_vectors
+from service.identify.attitude_from_matches import _matched_vectors
 from service.identify.hypotheses.groups import _log_weight_of
 from service.identify.voting.match_groups import _largest
 from service.identify.voting.pair_tests import cast_votes, count_votes, name_rivals
@@ -138,7 +138,7 @@ from service.sky.model import SkyModel
 zones = ["verified", "starid"]
 prewarm_kernels(SkyModel(load_embedded(), LruCache(64 << 20)), load_missions(), zones, seldom=True)
 of_votes = _largest, cast_votes, count_votes, name_rivals
-others = fit_attitude, matched_vectors, _log_weight_of
+others = fit_attitude, _matched_vectors, _log_weight_of
 print(*(len(each.signatures) for each in (*others, *of_votes)))
 """
 

@@ -123,7 +123,7 @@ def agreement(cases: Cases) -> Agreement:
     solved = np.zeros(count, bool)
     workspace = fit_workspace(stars)
     for k in range(count):
-        vectors = cases.b[k], cases.r[k], cases.sigma[k]
+        vectors = (np.array(each[k], order="C") for each in (cases.b, cases.r, cases.sigma))
         solved[k] = fit_attitude(*vectors, WORST_AXIS_RAD, QUEST, workspace)
         triads[k], quaternions[k] = workspace.quaternions[:START]
     least = np.linalg.eigvalsh(information(cases))[:, 0]

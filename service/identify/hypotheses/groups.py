@@ -41,6 +41,8 @@ were wrong: sometimes a star of one group also fits the attitude of the other.
 """
 
 _UNMATCHED, _UNIQUE, _AMBIGUOUS = (int(outcome) for outcome in Outcome)
+_NO_ROWS, _NO_VOXELS = np.empty(0, np.int32), np.empty((0, 0), np.uint8)
+"""A grid without stars; a kernel takes arrays of its module as locked ones, as a zone's are."""
 
 
 def may_be_a_group(masks: Sequence[Mask]) -> bool:
@@ -163,8 +165,8 @@ def log_weight_of_group(
     return float(
         _log_weight_of(
             sighted_at(seen, s),
-            run_catalog.direction[star],
-            run_catalog.magnitude_mag[star],
+            read_only(run_catalog.direction[star]),
+            read_only(run_catalog.magnitude_mag[star]),
             star,
             log_density(zone.direction, seen.axis[s], seen.least[s], seen.most[s]),
         )
@@ -202,18 +204,17 @@ def _log_weight_of(sighted, star_direction, star_magnitude, star, density):  # t
     if matched < 2:
         return evidence.log_null(n, with_magnitude(observed))
     # Only positions and magnitudes are used: the star grid and the bounds are empty.
-    nothing, rows = np.empty(0), np.empty(0, np.int32)
     stars = ZoneStars(
         direction=star_direction,
         magnitude=star_magnitude,
-        grid_start=rows,
-        grid_rows=rows,
+        grid_start=_NO_ROWS,
+        grid_rows=_NO_ROWS,
         grid_direction=star_direction,
-        voxels=rows,
+        voxels=_NO_VOXELS,
         axis=sighted.prior_axis,
         least=0.0,
         most=math.pi,
-        polar=nothing,
+        polar=np.empty(0),
         log_density=density,
     )
     return weigh(observed, stars, scratch.match, scratch)

@@ -172,26 +172,29 @@ def observed_triangles(direction: Vector, triangles: TriangleIndex) -> tuple[Row
 def scene_of(
     direction: Vector, sigma_rad: Vector, velocity_c: Vector, guide: Guide
 ) -> tuple[ObservedStars, ZoneStars]:
-    """Observed and guide stars in the form of the fit's kernels, without prior or magnitudes."""
+    """Observed and guide stars in the form of the fit's kernels, without prior or magnitudes.
+
+    Locked are those arrays that a zone locks: the fit is compiled for that alone.
+    """
     reference_sigma = float(sigma_rad.min()) if len(sigma_rad) else 1.0
     nothing = np.empty(0)
     observed = ObservedStars(
-        direction=locked(direction),
+        direction=np.array(direction, order="C"),
         magnitude=nothing,
-        sigma_rad=locked(sigma_rad),
+        sigma_rad=np.array(sigma_rad),
         weight=(reference_sigma / sigma_rad) ** 2,
         reference_sigma=reference_sigma,
-        velocity=locked(velocity_c),
+        velocity=np.array(velocity_c),
         prior_kind=0,
         prior_axis=np.zeros(3),
     )
     stars = ZoneStars(
         direction=guide.direction,
-        magnitude=nothing,
+        magnitude=locked(nothing),
         grid_start=guide.grid.start,
         grid_rows=guide.grid.rows,
         grid_direction=guide.grid.direction,
-        voxels=np.empty((0, 0), np.uint8),
+        voxels=locked(np.empty((0, 0), np.uint8)),
         axis=np.zeros(3),
         least=0.0,
         most=math.pi,

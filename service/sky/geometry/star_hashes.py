@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from service.compiled.jit import njit, njit_inlined, njit_no_refcount
-from service.vectors import Vector, read_only
+from service.vectors import Vector, locked, read_only
 
 CELL = 0.004
 """Width of a bucket's cell, about 0.23 deg at the middle of a face."""
@@ -152,7 +152,7 @@ def build_star_voxels(direction: Vector) -> Bits:
     size = 1 << max(7, (len(direction) * _BITS_PER_STAR // 8 - 1).bit_length())
     bits = np.zeros((len(REACH_RAD), size), np.uint8)
     for level in range(len(REACH_RAD)):
-        _fill(direction, REACH_RAD[level], _SCALE[level], bits[level])
+        _fill(locked(direction), REACH_RAD[level], _SCALE[level], bits[level])
     return read_only(bits)
 
 
