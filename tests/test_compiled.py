@@ -101,6 +101,60 @@ def test_what_a_copied_part_calls_is_not_copied_with_it():
         assert ("alwaysinline" in code) == is_copied
 
 
+def test_a_kernel_is_compiled_once_for_all_constants_that_kernels_call_it_with():
+    @njit_no_refcount
+    def scaled(value, factor):
+        return value * factor
+
+    @njit
+    def outer(value, factor):
+        return scaled(value, 2) + scaled(value, 3) + scaled(value, factor)
+
+    assert outer(1.0, 4) == 9.0
+    assert len(scaled._inner.overloads) == 1
+
+
+def test_a_kernel_that_needs_a_constant_still_gets_it():
+    @njit_no_refcount
+    def part(values, place):
+        return values[place]  # of different types, so that the place tells which
+
+    @njit
+    def outer(value):
+        values = value, True
+        return part(values, 0) if part(values, 1) else 0.0
+
+    assert outer(5.0) == 5.0
+
+
+def test_a_kernel_that_many_kernels_call_is_linked_once():
+    """Else each level of calls would hold the code of all below it."""
+
+    @njit_no_refcount
+    def lowest(value):
+        return value + 1.0
+
+    @njit_no_refcount
+    def left(value):
+        return lowest(value) * 2.0
+
+    @njit_no_refcount
+    def right(value):
+        return left(value) + lowest(value)
+
+    @njit
+    def outer(value):
+        return right(value) + left(value) + lowest(value)
+
+    assert outer(1.0) == 12.0
+    for each in (left, right):
+        (compiled,) = each._inner.overloads.values()
+        code = compiled.library.get_llvm_str()
+        assert [
+            line for line in code.splitlines() if line.startswith("define") and "lowest" in line
+        ] == []
+
+
 def test_an_error_in_what_a_kernel_calls_is_raised():
     @njit
     def checked(x):

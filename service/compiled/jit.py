@@ -2,9 +2,9 @@
 
 numba optimises every kernel with its callees and generates machine code before linking it into its
 callers, where this is repeated at each level of calls. That took half of the compile time. Here a
-kernel called by another one is only typed and translated; the one called by Python is optimised as
-a whole, and only that one is cached on disk. The same applies to numba's own functions that a
-kernel calls, such as sorts.
+kernel called by another one is only typed and translated, once for each kind of its arguments; the
+one called by Python is linked with all its callees, optimised as a whole, and only that one is
+cached on disk. The same applies to numba's own functions that a kernel calls, such as sorts.
 
 numba also counts references, with atomic operations, to every array argument, tuple element and
 slice. It omits counts that it can prove redundant, but not in large functions. In kernels that take
@@ -27,7 +27,9 @@ from numba.core.caching import FunctionCache
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_lock import global_compiler_lock
+from numba.core.errors import TypingError
 from numba.core.registry import CPUDispatcher
+from numba.core.types import unliteral
 
 from service.compiled.checked_file import CheckedFile
 
@@ -98,9 +100,11 @@ class Kernel(CPUDispatcher):
     """
 
     def __init__(self, function: Callable[..., Any], **options: Any) -> None:
-        options["nopython"] = True
+        # Python calls it through another wrapper, and nothing calls it from C.
+        options |= {"nopython": True, "no_cfunc_wrapper": True}
         # numba would pass this on from a kernel to its callees and theirs.
         options.setdefault("forceinline", False)
+        options.setdefault("error_model", "numpy")
         super().__init__(function, targetoptions=options, pipeline_class=_ForPython)
         try:
             self._cache = _LockedCache(function)
@@ -112,8 +116,8 @@ class Kernel(CPUDispatcher):
                 "in NUMBA_CACHE_DIR",
                 os.environ.get("NUMBA_CACHE_DIR"),
             ) from None
-        without = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-        self._inner = CPUDispatcher(function, targetoptions=options | without)
+        inner = {"nogil": True, "no_cpython_wrapper": True}
+        self._inner = _Inner(function, targetoptions=options | inner)
 
     def compile(self, sig: Any) -> Any:
         """Load the kernel for a signature from the cache, or compile it; one thread at a time."""
@@ -127,6 +131,19 @@ class Kernel(CPUDispatcher):
     def _numba_type_(self) -> Any:
         """The numba type that represents this kernel when another kernel calls it."""
         return self._inner._numba_type_
+
+
+class _Inner(CPUDispatcher):
+    """A kernel for kernels, compiled once for all constants that it is called with."""
+
+    def get_call_template(self, args: Any, kws: Any) -> Any:
+        """Compile the kernel for the types of its arguments, unless it needs their values."""
+        try:
+            # numba gives `unliteral` no types.
+            kinds = tuple(unliteral(each) for each in args)  # type: ignore[no-untyped-call]
+            return super().get_call_template(kinds, kws)
+        except TypingError:
+            return super().get_call_template(args, kws)
 
 
 class _LockedCache(FunctionCache):
@@ -187,6 +204,21 @@ class _MachineCodeLibrary(JITCodeLibrary):
     Otherwise the cache would also store bitcode for linking, which every process would load.
     """
 
+    def finalize(self) -> None:
+        """Link the kernel with all that it calls, and those call; then make machine code."""
+        callees: dict[Any, None] = {}
+
+        def collect(library: Any) -> None:
+            for each in library._linking_libraries:
+                if each not in callees:
+                    collect(each)
+                    callees[each] = None
+
+        collect(self)
+        # Callers first: LLVM leaves out a function that nothing has called by then.
+        self._linking_libraries = list(reversed(callees))
+        super().finalize()  # type: ignore[no-untyped-call]
+
     def _get_module_for_linking(self) -> Any:
         """Module of empty functions with the right names, by which numba finds the machine code."""
         names = [each.name for each in self._final_module.functions if not each.is_declaration]
@@ -202,12 +234,16 @@ class _BitcodeLibrary(JITCodeLibrary):
     def codegen(self) -> Any:
         return _WithoutEnvironment(self._codegen)
 
-    def _optimize_final_module(self) -> None:
-        """Do nothing: the kernel that includes this function is optimised as a whole."""
+    def add_ir_module(self, ir_module: Any) -> None:
+        """Add a function, but not the wrapper for C that numba makes of each of its own."""
+        if ir_module.name != "cfunc_wrapper":
+            super().add_ir_module(ir_module)  # type: ignore[no-untyped-call]
 
-    def _finalize_final_module(self) -> None:
+    def finalize(self) -> None:
+        """Leave linking and optimising to the kernel that this function is linked into."""
+        for library in self._linking_libraries:
+            self._reload_init.update(library._reload_init)
         self._finalize_dynamic_globals()  # type: ignore[no-untyped-call]
-        self._verify_declare_only_symbols()  # type: ignore[no-untyped-call]
         self._finalized = True
 
     def get_pointer_to_function(self, name: str) -> int:
