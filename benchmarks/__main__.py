@@ -16,6 +16,7 @@ from benchmarks.record import SERVICE, record_of
 from benchmarks.report import Report
 from benchmarks.speed import (
     chain,
+    clone_to_table,
     columns,
     compiling,
     exports,
@@ -83,6 +84,7 @@ BENCHMARKS: dict[str, Callable[[bool, int], Report]] = {
     "posts": posts.run,
     "first_posts": first_posts.run,
     "compiling": compiling.run,
+    "clone_to_table": clone_to_table.run,
     "live_filter": live_filter.run,
     "stored": stored.run,
     "chain": chain.run,
@@ -99,8 +101,8 @@ BENCHMARKS: dict[str, Callable[[bool, int], Report]] = {
     "tracker_sigmas": tracker_sigmas.run,
 }
 OF_SPEED = tuple(performance.TITLES)
-BY_NAME_ALONE = ("scale", "soak")
-"""These take up to an hour."""
+BY_NAME_ALONE = ("clone_to_table", "scale", "soak")
+"""These take up to an hour, or install packages."""
 DEFAULT_SEED = 19941026
 
 

@@ -1,90 +1,100 @@
-"""Compiling the kernels: processor time and machine code of each, in one process.
+"""Compiling the kernels: processor time and machine code of each, beside a commit before.
 
     python -m benchmarks compiling
 
-Everything is compiled into an empty folder, in the order of a first start with one processor.
-The time of a kernel includes what is compiled for it alone, and for it first.  Processor time
-moves less with other work on the machine than the clock does; an empty loop is timed beside it.
+`acquire prepare` with nothing compiled, of this tree and of the tree of `BASE`, one after the
+other.  The time of a kernel includes what is compiled for it alone, and for it first.  Processor
+time moves less with other work on the machine than the clock does; an empty loop is timed beside
+it.  A small sample leaves out the commit before.
 """
 
 import os
+import resource
 import subprocess
 import sys
 import tempfile
 import time
+from collections import defaultdict
 from pathlib import Path
-from typing import Any
-
-import msgspec
+from typing import Any, NamedTuple
 
 from benchmarks.bounds import at_most
+from benchmarks.compare.servers import HERE, checked_out, commit_of
 from benchmarks.report import Report
 
+BASE = "fb44b6f7"
+"""The commit that this one is held against: that before the first start was made shorter."""
 MOST_SHARE = 0.2
 """Largest share of one kernel in the processor time of all."""
+MOST_OF_BASE = 0.6
+"""Largest ratio of the processor time of all kernels to that of `BASE`."""
 ROUNDS = 10_000_000
-CHILD = """
-import gc, json, os, sys, time
+TIMES = "times.txt"
+HOOK = f"""
+import os, time
 from pathlib import Path
-from service.acquire.kernel_build import COLLECT_EVERY
-from service.acquire.prewarm import compile_beside_batches, prewarm_kernels
 from service.compiled.jit import Kernel
-from service.missions.identifiers import IDENTIFIERS
-from service.missions.mission import load_missions
-from service.sky.cache import LruCache
-from service.sky.catalog.star_catalog import load_embedded
-from service.sky.model import SkyModel
 
-found, compile_kernel = {}, Kernel.compile
+compile_kernel = Kernel.compile
 def measured(kernel, signature):
     started = time.process_time()
     try:
         return compile_kernel(kernel, signature)
     finally:
-        name = f"{kernel.py_func.__module__}.{kernel.py_func.__qualname__}"
-        found[name] = found.get(name, 0.0) + time.process_time() - started
+        seconds = time.process_time() - started
+        name = f"{{kernel.py_func.__module__}}.{{kernel.py_func.__qualname__}}"
+        with (Path(os.environ["NUMBA_CACHE_DIR"]) / "{TIMES}").open("a") as file:
+            file.write(f"{{name}} {{seconds}}\\n")
 Kernel.compile = measured
-gc.freeze()
-gc.set_threshold(COLLECT_EVERY)
-sky, missions = SkyModel(load_embedded(), LruCache(64 << 20), opens_files=False), load_missions()
-zones = [name for name, entry in IDENTIFIERS.items() if entry.searches_zone]
-started = time.process_time()
-prewarm_kernels(sky, missions, zones, seldom=True)
-in_zones = time.process_time() - started
-prewarm_kernels(sky, missions, [name for name in IDENTIFIERS if name not in zones])
-compile_beside_batches()
-json.dump([found, in_zones, time.process_time() - started], sys.stdout)
 """
+"""What each process of the command imports at its start."""
+
+
+class Compiled(NamedTuple):
+    """Kernels by name: processor time and size of machine code; processor time of everything."""
+
+    seconds: dict[str, float]
+    size_kb: dict[str, float]
+    whole_s: float
+
+    def of_kernel(self, name: str) -> str:
+        """Both figures of a kernel as text."""
+        if name not in self.seconds:
+            return "none"
+        # numba's names of files have the name of the module and that of the kernel.
+        size_kb = self.size_kb[".".join(name.split(".")[-2:])]
+        return f"{self.seconds[name]:.2f} s, {size_kb:.0f} kB"
 
 
 def run(quick: bool, seed: int) -> Report:
-    """The benchmark; there is no smaller one, and nothing random in it."""
-    with tempfile.TemporaryDirectory() as folder:
-        done = subprocess.run(
-            [sys.executable, "-c", CHILD],
-            env=os.environ | {"NUMBA_CACHE_DIR": folder},
-            stdout=subprocess.PIPE,
-            check=True,
-        )
-        seconds, in_zones_s, whole_s = msgspec.json.decode(
-            done.stdout, type=tuple[dict[str, float], float, float]
-        )
-        size_kb = _sizes_kb(Path(folder))
-    longest = max(seconds, key=lambda name: seconds[name])
+    """The benchmark; there is nothing random in it."""
+    now = _compiled(HERE)
+    all_s = sum(now.seconds.values())
     figures: dict[str, Any] = {
-        "kernels": len(seconds),
-        "all kernels, s of processor time": sum(seconds.values()),
-        "with the batches that they are compiled for, s": whole_s,
-        "of batches with a zone, s": in_zones_s,
-        "all kernels, kB": sum(size_kb.values()),
-        "empty loop of ten million rounds, s": empty_loop_s(),
+        "kernels": len(now.seconds),
+        "all kernels, s of processor time": all_s,
+        "with the batches that they are compiled for, s": now.whole_s,
+        "all kernels, kB": sum(now.size_kb.values()),
     }
-    for name in sorted(seconds, key=lambda name: -seconds[name]):
-        short = name.removeprefix("service.")
-        kept_kb = size_kb.get(".".join(name.split(".")[-2:]), 0.0)
-        figures[short] = f"{seconds[name]:.2f} s, {kept_kb:.0f} kB"
-    share = seconds[longest] / sum(seconds.values())
-    return Report("compiling", figures, [at_most("share of the longest", share, MOST_SHARE)])
+    bounds = [at_most("share of the longest", max(now.seconds.values()) / all_s, MOST_SHARE)]
+    before = None if quick else _compiled(checked_out(commit_of(BASE)))
+    if before is not None:
+        figures |= {
+            f"{BASE}: kernels": len(before.seconds),
+            f"{BASE}: all kernels, s of processor time": sum(before.seconds.values()),
+            f"{BASE}: with the batches that they are compiled for, s": before.whole_s,
+            f"{BASE}: all kernels, kB": sum(before.size_kb.values()),
+        }
+        ratio = all_s / sum(before.seconds.values())
+        bounds.append(at_most(f"all kernels over {BASE}", ratio, MOST_OF_BASE))
+    figures["empty loop of ten million rounds, s"] = empty_loop_s()
+    named = (before.seconds if before else {}) | now.seconds
+    for name in sorted(named, key=lambda name: -named[name]):
+        text = now.of_kernel(name)
+        figures[name.removeprefix("service.")] = (
+            text if before is None else f"{text}; {BASE}: {before.of_kernel(name)}"
+        )
+    return Report("compiling", figures, bounds)
 
 
 def empty_loop_s() -> float:
@@ -95,10 +105,26 @@ def empty_loop_s() -> float:
     return time.process_time() - started
 
 
-def _sizes_kb(folder: Path) -> dict[str, float]:
-    """The machine code of each kernel by module and name, as numba names its files."""
-    sizes: dict[str, float] = {}
-    for path in folder.rglob("*.nbc"):
-        name = path.name.split("-")[0]
-        sizes[name] = sizes.get(name, 0.0) + path.stat().st_size / 1e3
-    return sizes
+def _compiled(tree: Path) -> Compiled:
+    """Compile all kernels of a tree into an empty folder."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "sitecustomize.py").write_text(HOOK, "utf-8")
+        environment = {"NUMBA_CACHE_DIR": name, "PYTHONPATH": f"{name}{os.pathsep}{tree}"}
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        subprocess.run(
+            [sys.executable, "-m", "service.cli", "prepare"],
+            cwd=tree,
+            env=os.environ | environment,
+            stdout=subprocess.DEVNULL,
+            check=True,
+        )
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        seconds, size_kb = defaultdict[str, float](float), defaultdict[str, float](float)
+        for line in (folder / TIMES).read_text("utf-8").splitlines():
+            kernel, compiled_s = line.split()
+            seconds[kernel] += float(compiled_s)
+        for path in folder.rglob("*.nbc"):
+            size_kb[path.name.split("-")[0]] += path.stat().st_size / 1e3
+    spent_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return Compiled(dict(seconds), size_kb, spent_s)
