@@ -30,7 +30,7 @@ from tests.web.browser import CHROMIUM, Browser, chromium
 from tests.web.serving import Server
 
 FOLDER = Path(__file__).parents[1] / "docs" / "images"
-PICTURE = Path(__file__).parents[1] / "tests" / "pictures" / "cedarsolve-pleiades.jpg"
+PICTURE = Path(__file__).parents[1] / "tests" / "features" / "pictures" / "cedarsolve-pleiades.jpg"
 RUN = "sample-pass"
 BATCHES = 288
 START = "1999-03-01T00:00:00.000Z"
