@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from service.errors import BadFile, NotFound
 from service.resources import shipped
 from service.sky.catalog.coding import COLUMNS
+from service.sky.catalog.csv_file import read_csv_catalog
 from service.sky.catalog.star_catalog import Catalog, import_csv, load, load_embedded, moved, save
 from service.vectors import angle_between_deg, from_ra_dec
 
@@ -350,6 +351,28 @@ def test_a_damaged_csv_is_refused_with_line_column_and_value(tmp_path, content, 
         import_csv(path)
     for part in told:
         assert part in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("per_deg", "word"),
+    [((1 / 15, 1.0), "hours"), ((np.pi / 180, np.pi / 180), "radians")],
+)
+def test_places_in_hours_or_radians_are_refused(tmp_path, rng, per_deg, word):
+    file = tmp_path / "stars.csv"
+    ra, dec = rng.uniform(0, 360, 400), np.degrees(np.arcsin(rng.uniform(-1, 1, 400)))
+
+    def write(ra, dec):
+        rows = [f"s{k},{a},{d},5.0" for k, (a, d) in enumerate(zip(ra, dec, strict=True))]
+        file.write_text("\n".join(["id,ra_deg,dec_deg,magnitude", *rows]))
+
+    write(ra * per_deg[0], dec * per_deg[1])
+    with pytest.raises(BadFile, match=word):
+        read_csv_catalog(file)
+    write(ra, dec)
+    assert len(read_csv_catalog(file)["ra_deg"]) == 400
+    # A catalog of a field in the first hours is one in degrees.
+    write(ra / 15, dec / 4)
+    assert len(read_csv_catalog(file)["ra_deg"]) == 400
 
 
 def test_all_faults_of_a_file_are_told_at_once_up_to_twenty(tmp_path):

@@ -15,6 +15,8 @@ from service.errors import BadFile, Fault, shown_value
 
 FAULTS_SHOWN = 20
 MAX_ID_LENGTH = 64
+LEAST_JUDGED = 100
+"""Least number of stars whose range of places tells their unit."""
 FIRST_EPOCH, LAST_EPOCH = 1800.0, 2100.0
 """Earliest and latest Julian year of a position's epoch."""
 
@@ -91,7 +93,23 @@ def read_csv_catalog(path: Path) -> dict[str, npt.NDArray[Any]]:
         raise BadFile(faults[:FAULTS_SHOWN])
     if not labels:
         raise BadFile(Fault(path.name, "holds a header and no star"))
+    _require_degrees(values)
     return _columns(labels, values)
+
+
+def _require_degrees(values: Mapping[str, Sequence[float]]) -> None:
+    """Raise `BadFile` where the places of many stars are hours or radians by their ranges."""
+    ra, dec = np.array(values["ra_deg"]), np.array(values["dec_deg"])
+    if len(ra) < LEAST_JUDGED:
+        return
+    last = float(ra.max())
+    if last < 24.0 and np.ptp(dec) > 90.0:
+        message = "must be degrees; stars far apart in declination end before 24, as hours do"
+        raise BadFile(Fault("column ra_deg", message, f"{last:g}"))
+    farthest = float(np.abs(dec).max())
+    if 0.9 * math.tau < last < math.tau and 0.45 * math.pi < farthest <= 0.5 * math.pi:
+        message = "must be degrees; places end before 2 pi and half of pi, as radians do"
+        raise BadFile(Fault("columns ra_deg, dec_deg", message, f"{last:g}, {farthest:g}"))
 
 
 def _lines(path: Path) -> list[tuple[int, list[str]]]:
