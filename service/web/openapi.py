@@ -21,6 +21,7 @@ from starlette.responses import Response
 from service import __version__
 from service.contract.base import Record, component_name, described
 from service.contract.events import EVENT_DATA
+from service.feature import known_features
 from service.observations.input_formats import INPUT_FORMATS, NDJSON, input_formats
 from service.table_files.formats import TABLE_FORMATS, OutputFormat
 from service.web.middleware import API
@@ -294,11 +295,20 @@ class _Plain(GenerateJsonSchema):
         return False
 
 
+EXAMPLES = "examples.json"
+
+
 @cache
 def examples() -> dict[str, Any]:
-    """Examples from a real run: by operation, then `request` or status."""
-    text = (files("service.web") / "examples.json").read_text(encoding="utf-8")
-    found: dict[str, Any] = json.loads(text)
+    """Examples from a real run: by operation, then `request` or status.
+
+    Those of a feature's routes lie in its folder.
+    """
+    found: dict[str, Any] = {}
+    for package in ("service.web", *(each.package for each in known_features().values())):
+        file = files(package) / EXAMPLES
+        if file.is_file():
+            found |= json.loads(file.read_text(encoding="utf-8"))
     return found
 
 

@@ -1,7 +1,7 @@
 """The examples of `openapi.yaml`, taken from a real run: `python -m tests.web.examples`.
 
-They are written to `service/web/examples.json`; `make openapi` then puts them
-into `openapi.yaml`.
+They are written to `examples.json` of `service/web`, and of each feature for its own routes;
+`make openapi` then puts them into `openapi.yaml`.
 """
 
 import argparse
@@ -9,13 +9,16 @@ import gzip
 import json
 import tempfile
 import time
+from collections import defaultdict
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import httpx
 
 from service.app.factory import App, open_app
+from service.feature import known_features
 from service.features.definitive.part import Definitive
 from service.missions.mission import load_missions
 from service.missions.motion import LiveFilterSettings
@@ -26,10 +29,11 @@ from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
 from service.web.app import create_app
+from service.web.openapi import EXAMPLES
 from tests.fresh_databases import sqlite_at
 from tests.web.serving import Server, compile_kernels, ended, in_process_settings
 
-FILE = Path(__file__).parents[2] / "service" / "web" / "examples.json"
+ROOT = Path(__file__).parents[2]
 API = "/api/v1"
 Json = dict[str, Any]
 
@@ -409,7 +413,29 @@ def fresh_walk() -> Json:
             return walk(client, app)
 
 
+def packages() -> dict[str, str]:
+    """The package that holds the examples of each operation of a feature."""
+    features = [each for each in known_features().values() if "routes" in each.brings]
+    return {
+        route.name: feature.package
+        for feature in features
+        for router in import_module(f"{feature.package}.routes").ROUTERS
+        for route in router.routes
+    }
+
+
+def write(found: Json) -> None:
+    """Write the examples of operations to the folders of their routes."""
+    own, parts = packages(), defaultdict(dict)
+    for operation, known in found.items():
+        parts[own.get(operation, "service.web")][operation] = known
+    for package, part in parts.items():
+        file = ROOT.joinpath(*package.split("."), EXAMPLES)
+        text = json.dumps(part, indent=1, ensure_ascii=False) + "\n"
+        file.write_text(text, encoding="utf-8")
+
+
 if __name__ == "__main__":
     # With `--help` the parser ends the program before it writes the file.
     argparse.ArgumentParser(prog="python -m tests.web.examples", description=__doc__).parse_args()
-    FILE.write_text(json.dumps(fresh_walk(), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    write(fresh_walk())
