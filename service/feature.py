@@ -23,16 +23,17 @@ Nothing outside the folder of a feature imports it.  Its package holds a `Featur
 - `formats`: `INPUT_FORMATS`, input formats by name (`service.observations.input_formats`).
 - `serving`: `serving(app, metrics)`, an asynchronous context manager entered while the service
   serves; `check(settings)` raises `BadConfiguration` before anything is opened.
-- `routes`: `ROUTERS` are its routes of the API.
+- `routes`: `ROUTERS` are its routes of the API; their examples are the file `examples.json` of
+  the package (`python -m tests.web.examples` writes it).
 - `pages`: importing it registers its pages of the console; its templates and scripts lie in the
   folders `templates` and `static` of the package.  `PANELS`, if it is there, is what it adds to
   pages of others: functions of the `PageContext` by name of the page, which says what it takes.
 - `metrics`: `reads(app)`, functions by name that are called together at each scrape, with a
   deadline; `collect(app, found)` makes metrics of what they returned in time.
 - `telemetry`: reads an input format whose files hold no lines, by its name `FORMAT`.
-  `opened_upload(file, missions, spacecraft)` reads an upload (`ingest.replays.CountedLines`);
-  `add_options(parser)` declares options of `acquire replay`, and `files_of(parsed)` are the files
-  that they name (`replay.items.OtherFiles`).
+  `opened_upload(file, missions, spacecraft)` reads an upload
+  (`ingest.running_replay.CountedLines`); `add_options(parser)` declares options of `acquire
+  replay`, and `files_of(parsed)` are the files that they name (`replay.items.OtherFiles`).
 
 Another package brings a feature by an entry point of the group `acquire.features` that names its
 `Feature`.  Of features that `ACQUIRE_FEATURES_OFF` names, nothing but their package and `tables` is

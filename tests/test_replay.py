@@ -22,7 +22,7 @@ from service.replay.summary import ReplaySummary
 from service.settings import Settings
 from service.simulate.stretches import Pass, Trouble, Troubles
 from service.simulate.telemetry import draw_pass, read_objects
-from service.storage.queries.replays import mark_interrupted
+from service.storage.queries.replay_rows import mark_interrupted
 from service.web.app import create_app
 from tests.fresh_databases import sqlite_at
 from tests.web.serving import Server

@@ -9,12 +9,13 @@ from service.app.adoptions import CalibrationAdoptions
 from service.app.annotations import Annotations
 from service.app.context import Context
 from service.app.frames import Frames
+from service.app.gyro import Gyro
 from service.app.replays import Replays
 from service.app.results import Comparisons, Results
 from service.app.runs import Runs
 from service.app.service import Events, Service
 from service.app.single_projector import SingleProjector
-from service.app.spacecraft import Gyro, Spacecraft
+from service.app.spacecraft import Spacecraft
 from service.app.zones import Zones
 from service.feature import SETTING, feature_modules
 from service.ingest.missions_in_force import MissionsInForce
@@ -28,7 +29,7 @@ from service.sky.model import SkyModel
 from service.storage.projections.heads import HeadMaker, Sign
 from service.storage.projections.projector import Projector
 from service.storage.queries.histories import retired
-from service.storage.queries.replays import mark_interrupted
+from service.storage.queries.replay_rows import mark_interrupted
 from service.storage.recording.results import register
 from service.storage.recording.signing import Signer
 from service.storage.store import Store

@@ -19,14 +19,14 @@ from service.feature import SETTING, feature_modules
 from service.ingest.bulk import Bulk, Check, RecordBlocks
 from service.ingest.memory import require_memory_for_replay
 from service.ingest.missions_in_force import MissionsInForce
-from service.ingest.replays import CountedLines, RunningReplay
+from service.ingest.running_replay import CountedLines, RunningReplay
 from service.ingest.spool import Spool, SpooledReplay
 from service.ingest.submit import SubmissionService
 from service.ingest.worker_process import WorkerConfig
 from service.observations.decompress import Coding, Line, unpacked_lines
 from service.observations.input_formats import NDJSON, input_formats
 from service.observations.telemetry import read_lines, require_telemetry
-from service.storage.queries import replays
+from service.storage.queries import replay_rows
 from service.storage.recording.ids import unguessable_ulid
 from service.storage.recording.results import set_run_alarms
 from service.times import utc_now
@@ -188,13 +188,13 @@ class Replays:
                 log.warning("replay %s is not continued: %s", about.id, error)
                 self._given_up.add(about.id)
                 self._spool.release(about.id)
-                close = partial(replays.close_waiting, id=about.id, now=utc_now().text)
+                close = partial(replay_rows.close_waiting, id=about.id, now=utc_now().text)
                 self._context.change(close)
 
     def _resume(self, about: SpooledReplay) -> None:
         with self._context.reading_record() as connection:
-            stored = replays.find_replay(connection, about.id)
-        if stored is None or stored.state not in (*replays.UNFINISHED, "interrupted"):
+            stored = replay_rows.find_replay(connection, about.id)
+        if stored is None or stored.state not in (*replay_rows.UNFINISHED, "interrupted"):
             self._spool.drop(about.id)
             return
         bound = None if about.spacecraft is None else frozenset(about.spacecraft)
@@ -297,24 +297,24 @@ class Replays:
         if replay is None:
             moment = utc_now().text
             self._context.change(
-                lambda connection: replays.mark_cancelled(connection, known, moment)
+                lambda connection: replay_rows.mark_cancelled(connection, known, moment)
             )
         elif not replay.is_over:
             replay.cancel()
             replay.wait(CANCEL_WAIT_S)
         cancelled = self.get(known)
-        replays.require_cancellable(cancelled.state)
+        replay_rows.require_cancellable(cancelled.state)
         return cancelled
 
     def all(self, spacecraft: Collection[str] | None = None) -> list[Replay]:
         """List the latest replays, newest first; for `spacecraft` see `list_replays`."""
         with self._context.reading() as connection:
-            return replays.list_replays(connection, spacecraft)
+            return replay_rows.list_replays(connection, spacecraft)
 
     def get(self, id: str) -> Replay:
         """Read a replay with its progress and its refused lines."""
         with self._context.reading_record() as connection:
-            return replays.read_replay(connection, known_id(id, "replay"))
+            return replay_rows.read_replay(connection, known_id(id, "replay"))
 
     def processes(self) -> int:
         """Number of worker processes that are ready to compute replays."""

@@ -15,7 +15,7 @@ from sqlalchemy import Connection
 from sqlalchemy.exc import SQLAlchemyError
 
 from service.errors import AcquisitionError
-from service.storage.queries.replays import mark_interrupted, unfinished_replays
+from service.storage.queries.replay_rows import mark_interrupted, unfinished_replays
 from service.storage.sql.projector_lock import left_behind
 from service.storage.store import Store
 from service.times import utc_now

@@ -1,7 +1,4 @@
-"""Spacecraft: state, attitudes, rates of stars, worst batches, histories, and their tables.
-
-Gyro blocks are here as well: each recorded once, however often sent, and read back.
-"""
+"""Spacecraft: state, attitudes, rates of stars, worst batches, histories, and their tables."""
 
 from collections.abc import Collection, Iterator, Sequence
 from functools import partial
@@ -11,24 +8,18 @@ from typing import Any, Unpack
 from msgspec import UNSET, structs
 from sqlalchemy import Connection
 
-from service.app.context import Context, PageOfPeriod, known_id
+from service.app.context import Context, PageOfPeriod
 from service.contract import spacecraft as records
 from service.contract.alarms import Alarm
 from service.contract.base import Page
-from service.contract.spacecraft import GyroBlockRow, GyroSamples, Overview
-from service.errors import AcquisitionError, BadBatch, Fault, shown_value
-from service.gyro.blocks import GyroBlock, block_from_json, require_rates_within
-from service.ingest.solver_pool import mission_in_input
-from service.missions.mission import Mission, mission_named
-from service.missions.motion import largest_rate_deg_per_s
+from service.contract.spacecraft import Overview
+from service.errors import BadBatch, Fault, shown_value
+from service.missions.mission import Mission
 from service.observations.schema import LIVE
-from service.storage import gyro as blocks
 from service.storage.queries import fleet, histories, time_buckets, trends
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.trends import worst_batches
-from service.storage.recording.ids import Ulids
 from service.storage.recording.result_metrics import is_waiting
-from service.storage.sql.columns import Row
 from service.table_files.table import Column, Table
 from service.table_files.table import Page as TablePage
 from service.times import Utc, utc_now, utc_of_unix
@@ -279,60 +270,3 @@ def _about(history: records.History) -> dict[str, str]:
         "start": history.start or "",
         "end": history.end or "",
     }
-
-
-class Gyro:
-    """Service that records and reads gyro blocks."""
-
-    def __init__(self, context: Context) -> None:
-        self._context = context
-        self._ids = Ulids()
-
-    def submit(self, name: str, sent: bytes) -> blocks.Recorded:
-        """Record the gyro block in a JSON body; see `record`."""
-        mission_named(self._context.missions, name)
-        return self.record(block_from_json(sent, name))
-
-    def record(self, block: GyroBlock) -> blocks.Recorded:
-        """Record a gyro block; a repeat of the same body gets the recorded one.
-
-        Raises `BadBatch` for an unknown spacecraft and for a rate beyond the largest of its
-        mission, `Conflict` where another body has its name, and `SampleTaken` where another block
-        of the spacecraft and the run holds one of its times.
-        """
-        (recorded,) = self.record_many([block])
-        if isinstance(recorded, AcquisitionError):
-            raise recorded
-        return recorded
-
-    def record_many(self, group: Sequence[GyroBlock]) -> list[blocks.Recorded | AcquisitionError]:
-        """Record gyro blocks in one transaction; a refused one has its error in the list."""
-        received = utc_now()
-        found: dict[int, blocks.Recorded | AcquisitionError] = {}
-        rows: dict[int, Row] = {}
-        for place, block in enumerate(group):
-            try:
-                mission = mission_in_input(self._context.missions, block.spacecraft)
-                require_rates_within(block, largest_rate_deg_per_s(mission.gyro))
-            except AcquisitionError as error:
-                found[place] = error
-            else:
-                rows[place] = blocks.row_of(block, self._ids.new(), received)
-
-        def change(connection: Connection) -> dict[int, blocks.Recorded | AcquisitionError]:
-            return {
-                place: blocks.record_or_refuse(connection, group[place], row)
-                for place, row in rows.items()
-            }
-
-        found |= self._context.change(change) if rows else {}
-        return [found[place] for place in range(len(group))]
-
-    def page(self, name: str, **asked: Unpack[PageOfPeriod]) -> Page[GyroBlockRow]:
-        """Page of the gyro blocks in a period without their samples, the earliest first."""
-        return self._context.page(blocks.list_blocks, blocks.BlockFilter, name, asked)
-
-    def get(self, name: str, id: str) -> GyroSamples:
-        """Read a gyro block of a spacecraft with its samples."""
-        with self._context.reading() as connection:
-            return blocks.read_block(connection, name, known_id(id, "gyro block"))

@@ -13,7 +13,7 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from service.cli.tables import markdown
+from service.cli.markdown import markdown
 from service.errors import BadInput, Fault, shown_value
 from service.intervals import Interval
 from studies.documents import pictures_in

@@ -14,7 +14,7 @@ import numpy as np
 
 from service.acquire import acquire
 from service.acquire.prewarm import prewarm_kernels
-from service.cli.tables import markdown
+from service.cli.markdown import markdown
 from service.identify.prior_attitude import prior_attitude, search_region
 from service.missions.mission import Band, Identifier, Mission
 from service.sky.geometry.pairs import PAIRS_PER_BIN, build_pairs

@@ -7,7 +7,7 @@ from typing import Any, TextIO
 
 import numpy as np
 
-from service.cli.tables import markdown
+from service.cli.markdown import markdown
 from service.errors import BadInput, Fault
 from service.missions.mission import RunCatalogSettings
 from service.sky.catalog.run_catalog import build_run_catalog

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from service.cli.tables import markdown
+from service.cli.markdown import markdown
 from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.geometry.kvector import KVector, build_kvector
 from service.sky.geometry.triangles import TriangleIndex, build_triangles

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from service.cli.tables import markdown
+from service.cli.markdown import markdown
 from studies.ptp_2015 import projections
 from studies.ptp_2015.comparison import Database, Tally
 from studies.ptp_2015.plots import PlottedSeries

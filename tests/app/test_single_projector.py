@@ -16,7 +16,7 @@ from service.features.calibration.estimates import CalibrationRequest
 from service.features.calibration.part import Calibrations
 from service.observations.schema import submission_from_json
 from service.settings import Settings
-from service.storage.queries.replays import find_replay
+from service.storage.queries.replay_rows import find_replay
 from service.storage.sql.tables import results
 from tests.features.calibration.wrong_file import true_batches, write_mission_files
 from tests.storage import samples

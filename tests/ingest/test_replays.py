@@ -72,7 +72,7 @@ def test_lines_that_can_be_closed_are_closed_at_the_end(app, lines):
 def test_that_a_replay_is_over_is_noted_once_the_database_can_be_written_again(
     app, lines, monkeypatch
 ):
-    monkeypatch.setattr("service.ingest.replays.SAVE_PAUSE_S", 0.01)
+    monkeypatch.setattr("service.ingest.running_replay.SAVE_PAUSE_S", 0.01)
     change, refused = app.store.writer.change, []
 
     def refuse(change):

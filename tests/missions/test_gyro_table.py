@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.app.context import Context
-from service.app.spacecraft import Gyro
+from service.app.gyro import Gyro
 from service.errors import BadBatch, BadConfiguration
 from service.gyro.blocks import GyroBlockIn, block_from_model
 from service.missions.mission import load_missions, parse_mission

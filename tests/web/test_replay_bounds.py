@@ -15,10 +15,10 @@ import zstandard
 from sqlalchemy import text
 
 from service.app.factory import open_app
-from service.ingest import replays as replays_module
-from service.ingest.replays import RunningReplay
+from service.ingest import running_replay
+from service.ingest.running_replay import RunningReplay
 from service.observations import decompress
-from service.storage.queries import replays as replay_rows
+from service.storage.queries import replay_rows
 from service.web.app import create_app
 from tests.waiting import wait_until
 from tests.web.browser import CHROMIUM
@@ -49,8 +49,8 @@ def begun(client, run, data, coding="identity", **headers):
 @pytest.fixture
 def few_blank_lines(monkeypatch):
     """The bound of blank lines, set so low that reading up to it takes no time."""
-    monkeypatch.setattr(replays_module, "MAX_BLANK_LINES", 20_000)
-    return replays_module.MAX_BLANK_LINES
+    monkeypatch.setattr(running_replay, "MAX_BLANK_LINES", 20_000)
+    return running_replay.MAX_BLANK_LINES
 
 
 @pytest.fixture

@@ -276,7 +276,7 @@ def _changed(mission: "Mission", table: str, key: str, value: float, option: str
 
 
 def _text(mission: "Mission", epoch_year: float, found: "list[ZoneEstimate]") -> str:
-    from service.cli.tables import markdown
+    from service.cli.markdown import markdown
     from service.sky.geometry.pairs import MAX_PAIRS
 
     header = (

@@ -24,7 +24,7 @@ from service.errors import AcquisitionError, BadBatch, BadInput, Busy, Fault, St
 from service.ingest.bulk import Bulk, BulkChunk, Check, LineAnswer
 from service.observations.decompress import Line
 from service.storage.gyro import Recorded
-from service.storage.queries import replays
+from service.storage.queries import replay_rows
 from service.storage.recording import events
 from service.storage.recording.unsaved_result import Answered
 from service.storage.store import Store
@@ -93,7 +93,7 @@ class ProgressRecorder:
         replay = records.Replay(**structs.asdict(progress), packets=self.packet_counts(), errors=[])
 
         def store(connection: Connection) -> None:
-            replays.insert_replay(connection, replay)
+            replay_rows.insert_replay(connection, replay)
             also(connection)
             events.add_event(connection, "replay", progress, run=self.run)
 
@@ -139,11 +139,11 @@ class ProgressRecorder:
 
         def store(connection: Connection) -> None:
             stored = progress
-            if replays.is_cancelled(connection, self.id):
+            if replay_rows.is_cancelled(connection, self.id):
                 self._on_cancelled()
                 ended = finished or self._now()
-                stored = structs.replace(progress, state=replays.CANCELLED, finished=ended)
-            replays.update_replay(connection, stored, packets, errors)
+                stored = structs.replace(progress, state=replay_rows.CANCELLED, finished=ended)
+            replay_rows.update_replay(connection, stored, packets, errors)
             events.add_event(connection, "replay", stored, run=self.run)
 
         self.require_saved()
@@ -437,7 +437,7 @@ class RunningReplay:
                 if close is not None:
                     close()
                 if self._cancelled and state == "interrupted":
-                    state = replays.CANCELLED
+                    state = replay_rows.CANCELLED
                 self._progress.conclude(state, self._closing)
                 self._ended(state)
             finally:
