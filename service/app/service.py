@@ -33,7 +33,10 @@ from service.times import Utc, utc_now
 log = logging.getLogger(__name__)
 
 WARM_UP_RUNS = 8
-"""Number of warm-up runs of a recorded batch; the interpreter then has specialised its code."""
+"""Number of extra runs of recorded batches before the service takes its first batch.
+
+The interpreter then has specialised its code.
+"""
 CREDITS = (
     "Hipparcos and Tycho-2 catalogs: ESA 1997, ESA/ESTEC; Hog et al. 2000",
     "Method: D. Fink and D. Shoup, Goddard Space Flight Center, 1994",

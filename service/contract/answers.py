@@ -75,7 +75,7 @@ class Detection(Record, frozen=True, kw_only=True):
 
     component: ClassVar[str] = "DetectionOut"
     u_px: float | None
-    """Column of the candidate; null if it could not be measured, for the reason in `left_out`."""
+    """Place along the frame's columns, in pixels; null if not measured, see `left_out`."""
     v_px: float | None
     sigma_u_px: Annotated[float | None, doc("Predicted, one standard deviation.")]
     sigma_v_px: float | None

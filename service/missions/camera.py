@@ -51,7 +51,7 @@ ROOM = 1.3
 """Factor by which a roughly stated field of view may be too small."""
 WANTED_STARS = 40
 STARS_TO_MAG = ((4.0, 516), (5.0, 1610), (6.0, 4999), (7.0, 15495), (8.0, 45598), (9.0, 130172))
-"""Number of stars of the whole sky that are brighter than a magnitude."""
+"""Magnitudes, each with the number of stars of the whole sky that are brighter."""
 SIGMA_PX, ROUGH_SIGMA_PX = 0.3, 1.0
 LARGEST_PAIR_DEG = 8.0
 REQUIRED_OF_CAMERAS = frozenset(

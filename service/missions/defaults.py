@@ -103,7 +103,10 @@ class Given:
         return None if axis is None else [_number(each) for each in axis]
 
     def error_deg(self) -> float:
-        """The largest a priori attitude error in degrees, about each axis or of the pole."""
+        """The largest a priori attitude error in degrees, as the mission file says or by default.
+
+        It is that about each axis, or of the pole.
+        """
         default = LOST_ERROR_DEG if self.sun_axis() is None else SUN_ERROR_DEG
         return _positive(self.table.get("a_priori_error_deg", default))
 

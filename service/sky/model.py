@@ -45,7 +45,7 @@ class SkyModel:
     catalog: Catalog
     cache: LruCache
     require_whole_sky: Callable[[], None] = field(default=lambda: None, kw_only=True)
-    """A function that raises `Busy` while the kernels for whole-sky searches are being compiled."""
+    """Called before a search of the whole sky; raises `Busy` while its kernels are compiled."""
     builder: Executor | None = field(default=None, kw_only=True)
     """The executor that builds missing files, during which `BeingBuilt` is raised.
 

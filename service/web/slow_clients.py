@@ -196,7 +196,10 @@ They are read to their end, because many clients look for an answer only then; r
 as clients can send them, they would keep the processor from all other requests.
 """
 DISCARDING_SHARE = 0.1
-"""The share of the event loop's time that such bodies may take: small chunks are expensive."""
+"""Largest share of the event loop's time for reading bodies that are answered already.
+
+Small chunks take more time than their bytes tell.
+"""
 LEAST_PAUSE_S = 0.005
 
 _LOG = logging.getLogger("uvicorn.error.connections")

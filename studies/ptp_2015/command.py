@@ -247,7 +247,7 @@ def _in_short(found: Measurements) -> list[str]:
 
 
 def _axis() -> str:
-    """Table of the paper's principal axis, recovered from its Table 1, and of our own axes."""
+    """Table of the principal axis of triangle sides: the paper's, from its Table 1, and ours."""
     paper = the_ptp_paper()
     rows = [("paper, from Table 1", f"{paper.catalog_stars:,}", "", *_numbers(paper.axis))]
     rows[0] = (*rows[0], f"{paper.mean_projection:.2f}")

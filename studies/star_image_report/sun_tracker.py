@@ -125,7 +125,7 @@ class ThreeDetectors:
         return self.acquired_light(0.0, 0.0), self.flank_light(0.0, 0.0)
 
     def acquired_light(self, p_arcmin: float, q_arcmin: float) -> float:
-        """Mean light of the direct sun on the middle detector, 1 if the sun covers it."""
+        """Mean light on the middle detector of the sun, p and q off its centre; 1 if covered."""
         edge = self.acquire_arcmin
         near = ((np.arange(self.samples) + 0.5) / self.samples - 0.5) * edge
         away = np.hypot(near[None, :] - p_arcmin, near[:, None] - q_arcmin)

@@ -376,11 +376,11 @@ class ActiveAlarms:
         self._unsaved: set[Subject] = set()
 
     def has(self, subject: Subject) -> bool:
-        """True if a monitored subject has an active alarm."""
+        """True if a quantity, of a tracker or of the spacecraft, has an alarm not yet cleared."""
         return subject in self._alarms
 
     def is_out(self, subject: Subject) -> bool:
-        """True if a monitored subject has an active alarm and is out of limits."""
+        """True if a quantity has an alarm not yet cleared, and is out of limits now."""
         return self.has(subject) and self._alarms[subject]["current_severity"] is not None
 
     def observe(

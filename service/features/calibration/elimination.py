@@ -171,7 +171,7 @@ def eliminate(
 
 
 def _normals(matrix: Matrix, full: Matrix) -> tuple[Normal, ...]:
-    """Normal equations from blocks (f, p + 1, p + 1) whose last row holds the residuals."""
+    """Normal equations from blocks (f, p + 1, p + 1); the last row is that of the residuals."""
     return tuple(
         Normal(block[:-1, :-1], -block[:-1, -1], float(block[-1, -1]), own)
         for block, own in zip(matrix, full, strict=True)

@@ -79,7 +79,7 @@ class DefinitiveDays:
         return progress
 
     def innovations(self, name: str, **asked: Unpack[PageOfPeriod]) -> Page[records.Innovation]:
-        """Page of innovations (measured minus predicted attitudes), earliest first."""
+        """List a page of innovations (measured minus predicted attitudes), earliest first."""
         return self._context.page(period.list_innovations, ResultFilter, name, asked)
 
     def of_period(

@@ -224,7 +224,7 @@ def _refit(
 
 
 def _scale(fit: LensFit, sigma: Vector) -> float:
-    """The median ratio of a fit's residuals to their sigmas, as a factor on sigmas; at least 1."""
+    """Factor, at least 1, by which sigmas must grow to agree with a fit's median residual."""
     pull = np.abs(fit.residual_px) / sigma[:, None]
     # With few stars the fit absorbs a part of the residuals.
     freedom = max(pull.size - fit.parameters, 1) / pull.size

@@ -15,7 +15,10 @@ from service.sky.geometry.directions import axes_across
 from service.vectors import Vector, locked
 
 CELLS = 1632
-"""Cells along an edge of the square, of 3.7 to 11 arcmin (333 kB: several fit into a cache)."""
+"""Cells along an edge of the square to which the whole sky is unfolded, of 3.7 to 11 arcmin.
+
+A bitmap takes 333 kB: several fit into a cache.
+"""
 SAMPLE_RAD = 6e-4
 """Spacing of the points that fill a disc, less than the narrowest cell."""
 RIM_RAD, RIM_SAMPLE_RAD = 1.5e-4, 1e-4

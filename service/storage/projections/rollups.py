@@ -65,7 +65,7 @@ _TRACKERS = prepared(
 
 
 class RecordedResult(Struct, eq=False, dict=True):
-    """A result with its batch, and with each tracker's contribution where there are several."""
+    """Rows of a recorded result and its batch, and those of each tracker where there are several."""
 
     result: Row
     """Columns of `results`, with the batch's name, time and moment of receipt."""

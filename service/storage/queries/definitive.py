@@ -41,7 +41,10 @@ BLOCKS = select(
     graded_blocks.c.packed,
 ).join_from(graded_days, graded_blocks, graded_blocks.c.day_id == graded_days.c.id)
 MOST_BLOCKS = 48
-"""Largest number of blocks read for a grade: two days at 1 Hz, or spread over longer periods."""
+"""Largest number of blocks that are read of filtered or smoothed attitudes, or of innovations.
+
+They are two days at 1 Hz; of a longer period, blocks spread over it are read.
+"""
 
 
 class DefinitiveStretchInfo(Struct, frozen=True, kw_only=True):

@@ -169,7 +169,7 @@ class Listing:
     """Ids of the only archive parts to search; None for all."""
 
     def first_rows(self, connection: Connection, limit: int, beyond: Place | None = None) -> Merged:
-        """The first `limit` rows of the query after a position."""
+        """The first `limit` rows after a position, merged from the database and the archive."""
         query = self.query
         if beyond is not None:
             place, bound = tuple_(*PLACE), tuple_(*beyond)

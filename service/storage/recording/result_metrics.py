@@ -71,7 +71,7 @@ _VALUES_OF = [QUANTITIES[name].value_of for name in tables.VALUES]
 
 
 def rolled_up(current: Sequence[Row]) -> Row:
-    """Sum up current results as the columns of a rollup."""
+    """One row of a rollup from current results: counts, sums, least and greatest values."""
     observed = [row["observed"] for row in current]
     status = [row["status"] for row in current]
     counts = (

@@ -21,7 +21,7 @@ class Proof(msgspec.Struct, kw_only=True):
     """An inclusion proof of a result; digests are in hexadecimal digits."""
 
     result: str
-    """Id of the proven result."""
+    """Id of the result whose inclusion in the record is proven."""
     answer_sha256: str
     """SHA-256 of the answer, byte for byte as sent."""
     content: str

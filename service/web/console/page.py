@@ -215,7 +215,7 @@ def open_layout(run: str, title: str, section: str) -> Layout:
 
 @dataclass(frozen=True)
 class Panel:
-    """Part of a page that a feature draws: its template, with `values`."""
+    """Part of a page that a feature adds: the name of its template, and `values` for it."""
 
     template: str
     values: Any

@@ -41,7 +41,7 @@ class Liebe:
 
     @property
     def entries(self) -> int:
-        """Number of triangles in the database: six per star."""
+        """Number of triangles in Liebe's database: six per star."""
         return len(self.star)
 
     @property
