@@ -48,7 +48,7 @@ class Detection(Model, frozen=True, kw_only=True):
     """Candidate for a star on a frame. The first pixel's centre is (0, 0); u counts columns."""
 
     u_px: float | None
-    """Column of the candidate; None if it could not be measured, for the reason in `left_out`."""
+    """Place along the frame's columns, in pixels; None if not measured, see `left_out`."""
     v_px: float | None
     sigma_u_px: float | None
     """Predicted, one standard deviation."""

@@ -65,7 +65,7 @@ _TRACKERS = prepared(
 
 
 class RecordedResult(Struct, eq=False, dict=True):
-    """Rows of a recorded result and its batch, and those of each tracker where there are several."""
+    """Rows of a recorded result and its batch, and those of its trackers if there are several."""
 
     result: Row
     """Columns of `results`, with the batch's name, time and moment of receipt."""
