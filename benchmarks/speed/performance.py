@@ -57,6 +57,7 @@ TITLES = {
     "kernels": "Kernels: votes, TRIAD and QUEST; pairs of stars",
     "pipeline": "The whole way of a batch, zones cold and cached",
     "verified_cost": "Verified identification beside the votes",
+    "compiling": "Compiling the kernels",
     "posts": "Single posts, bulk, both at once, start, memory",
     "live_filter": "Posts with a gyro and the live filter beside posts without",
     "stored": "As the database fills",
@@ -65,6 +66,10 @@ TITLES = {
 }
 ABOUT = {
     "pipeline": "Single calls of the core without records; see `benchmarks/speed/pipeline.py`.",
+    "compiling": (
+        "Processor time and machine code of each kernel, beside an earlier commit, each compiled "
+        "into an empty folder. The time of a kernel includes what is compiled for it first."
+    ),
     "posts": (
         "The service as it is served, over SQLite with synchronous=FULL, beside a no-op of the "
         "same server and framework whose route declares the same body, so that the framework "
