@@ -42,7 +42,9 @@ def measured(kernel, signature):
         return compile_kernel(kernel, signature)
     finally:
         seconds = time.process_time() - started
-        name = f"{{kernel.py_func.__module__}}.{{kernel.py_func.__qualname__}}"
+        # As numba names its files, and the same where a folder was renamed.
+        module = kernel.py_func.__module__.rpartition(".")[2]
+        name = f"{{module}}.{{kernel.py_func.__qualname__}}"
         with (Path(os.environ["NUMBA_CACHE_DIR"]) / "{TIMES}").open("a") as file:
             file.write(f"{{name}} {{seconds}}\\n")
 Kernel.compile = measured
@@ -61,9 +63,7 @@ class Compiled(NamedTuple):
         """Both figures of a kernel as text."""
         if name not in self.seconds:
             return "none"
-        # numba's names of files have the name of the module and that of the kernel.
-        size_kb = self.size_kb[".".join(name.split(".")[-2:])]
-        return f"{self.seconds[name]:.2f} s, {size_kb:.0f} kB"
+        return f"{self.seconds[name]:.2f} s, {self.size_kb[name]:.0f} kB"
 
 
 def run(quick: bool, seed: int) -> Report:
@@ -91,9 +91,7 @@ def run(quick: bool, seed: int) -> Report:
     named = (before.seconds if before else {}) | now.seconds
     for name in sorted(named, key=lambda name: -named[name]):
         text = now.of_kernel(name)
-        figures[name.removeprefix("service.")] = (
-            text if before is None else f"{text}; {BASE}: {before.of_kernel(name)}"
-        )
+        figures[name] = text if before is None else f"{text}; {BASE}: {before.of_kernel(name)}"
     return Report("compiling", figures, bounds)
 
 
