@@ -160,11 +160,13 @@ def _set(source: ccsds.Source, line: int, fields: Mapping[str, str]) -> ElementS
     number = {name: _number(source, line, name, fields) for name in _NUMBERS}
     if "EPOCH" not in fields:
         raise source.bad(line, "EPOCH", "is missing")
+    # Older answers of Space-Track have a space between date and time.
+    epoch = fields["EPOCH"].replace(" ", "T", 1)
     try:
-        epoch_ns = ccsds.epoch_ns(fields["EPOCH"], "UTC")
+        epoch_ns = ccsds.epoch_ns(epoch, "UTC")
     except ValueError as error:
         raise source.bad(line, "EPOCH", str(error), fields["EPOCH"]) from None
-    utc = parse_utc(_BEYOND_NS.sub(r"\1", fields["EPOCH"]))
+    utc = parse_utc(_BEYOND_NS.sub(r"\1", epoch))
     per_min = math.tau / (DAY_S / 60.0)
     elements = Satrec()
     elements.sgp4init(

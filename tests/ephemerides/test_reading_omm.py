@@ -113,6 +113,15 @@ def test_every_form_gives_the_states_of_the_two_line_set(form, tmp_path):
             np.testing.assert_allclose(known.at(moment), wanted.at(moment), rtol=0, atol=2e-5)
 
 
+@pytest.mark.parametrize("form", FORMS)
+def test_an_epoch_may_have_a_space_for_its_t_and_a_z(form, tmp_path):
+    fields = fields_of(ISS)
+    known = read(FORMS[form](fields), tmp_path)
+    for epoch in (fields["EPOCH"].replace("T", " "), fields["EPOCH"] + "Z"):
+        other = read(FORMS[form](fields | {"EPOCH": epoch}), tmp_path)
+        assert np.array_equal(other.at(ISS_EPOCH), known.at(ISS_EPOCH))
+
+
 def test_the_verification_sets_have_the_same_states_as_elements(tmp_path):
     compared = 0
     for _, first, second, states in published():
