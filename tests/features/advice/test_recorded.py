@@ -10,7 +10,7 @@ from sqlalchemy import func, select
 from service.acquire import acquire
 from service.errors import BadBatch, Busy, NotFound
 from service.features.advice.advice import advise
-from service.features.advice.part import AdviceService, advice_record
+from service.features.advice.part import AdviceService, ZoneSizes, advice_record
 from service.features.advice.statements import zone_statements
 from service.observations.schema import OptionsIn, submission_from_json, tolerances_from_text
 from service.simulate.stretches import Pass
@@ -130,7 +130,7 @@ def test_the_advice_is_that_of_the_batches_themselves_and_changes_nothing(
         recorded[-1]["time"],
         BATCHES,
     ]
-    zone = zone_statements(mission, *app.zones.advised_size("XTE", "night"))
+    zone = zone_statements(mission, *ZoneSizes(app.context).advised("XTE", "night"))
     # Batches came in another order, which sums of floats may tell in their last digit.
     expected = to_builtins(advice_record("XTE", "night", sample, plain, zone))
     given = to_builtins(found)

@@ -7,7 +7,8 @@ import pytest
 from astropy.io import fits
 from PIL import Image
 
-from service.acquire.picture import blind_sky, overlay_of, solve_picture
+from service.acquire.picture import blind_sky, solve_picture
+from service.features.pictures.overlay import overlay_of
 from service.identify.blind.lens import Lens
 from service.identify.blind.solver import focal_px_of
 from service.imaging.detection.points import find_points

@@ -9,9 +9,10 @@ import pytest
 from PIL import Image
 from scipy.stats import chi2
 
-from service.acquire.picture import MOST_SIGMA_SHARE, blind_sky, overlay_of, solve_picture
+from service.acquire.picture import MOST_SIGMA_SHARE, blind_sky, solve_picture
 from service.cli import main
 from service.errors import BadFile
+from service.features.pictures.overlay import overlay_of
 from service.identify.blind.lens import Lens
 from service.identify.blind.solver import FocalRange, focal_px_of
 from service.identify.blind.verify import Points
