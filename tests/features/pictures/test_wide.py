@@ -145,7 +145,7 @@ def test_clear_points_that_are_no_sky_get_a_plain_sentence(blind):
 
 @pytest.mark.parametrize("projection", [None, *PROJECTIONS])
 def test_points_at_random_have_no_attitude_behind_any_lens(blind, projection, rng):
-    for _ in range(draws(1, 100)):
+    for _ in range(draws(1, 12)):
         counts = rng.normal(100.0, NOISE, (HEIGHT, WIDTH))
         for _ in range(int(rng.integers(30, 120))):
             u, v = rng.uniform(10.0, WIDTH - 10.0, 1), rng.uniform(10.0, HEIGHT - 10.0, 1)
