@@ -95,6 +95,8 @@ def doubled(value):
 @pytest.fixture
 def cache(monkeypatch, tmp_path):
     """An empty folder of compiled kernels, and a function that calls one through it."""
+    # numba reads a changed environment again when it first compiles something.
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
     return tmp_path, lambda: Kernel(doubled)(21)
 
