@@ -178,6 +178,16 @@ def test_a_chart_zooms_and_pans_and_the_address_says_where(browser, address, ful
     assert browser.complaints == []
 
 
+def test_every_chart_is_drawn_on_a_logarithmic_axis(browser, address, client, drawn, run):
+    """Small and large values: uPlot leaves out most of the ticks of many decades."""
+    for batch in drawn("SOHO", 24, cadence_s=600.0):
+        batch["observations"][0]["stars"][0]["magnitude"] = 2.0
+        assert client.post("/api/v1/batches", json=batch | {"run": run}).status_code == 201
+    browser.open(f"{address}/spacecraft/SOHO?run={run}&y=log")
+    browser.wait(lambda: browser.run(DRAWN))
+    assert browser.complaints == []
+
+
 SIGN = """(form => { form.elements.who.value = 'J. Operator';
     form.elements.comment.value = 'it is clear'; form.querySelector('.main').click(); })(
     document.querySelector('dialog form'))"""

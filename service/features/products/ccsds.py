@@ -85,7 +85,7 @@ def header(about: attitudes.SeriesInfo) -> Pairs:
         comments.append(
             f"{what} from {about.start or 'the first'} to before {about.end or 'the end'}"
         )
-    comments.append(f"Largest gap within a segment {about.largest_gap_s!r} s")
+    comments.append(f"Largest gap within a segment {round(about.largest_gap_s, 6)!r} s")
     if about.record_head:
         comments.append(f"Record head {about.record_head}")
     return [

@@ -82,8 +82,9 @@ class VoteRow:
                 "more stars in the field that agree with one of them"
             )
         if rivals:
+            votes = "one vote" if found.votes == 1 else f"{found.votes} votes"
             return (
-                f"{', '.join(rivals)} have {found.votes} votes each; unique needs one star with "
+                f"{', '.join(rivals)} have {votes} each; unique needs one star with "
                 "more: narrower tolerances, or more stars in the field"
             )
         if found.probability is not None:

@@ -299,7 +299,7 @@ export class Trend {
       bands,
       axes: [
         { ...axis, values: tickLabels, space: 74, size: 64 },
-        { ...axis, size: labelWidth, values: (_, splits) => splits.map((value) => `${+value.toPrecision(6)}${this.definition.unit}`) },
+        { ...axis, size: labelWidth, values: (_, splits) => splits.map((value) => (value === null ? "" : `${+value.toPrecision(6)}${this.definition.unit}`)) },
       ],
       hooks: {
         ready: [(chart) => reportClicks(chart, this.history.bucket_s ?? 1)],
