@@ -12,8 +12,8 @@ _PACKAGE = Path(__file__).resolve().parent
 def shipped(*parts: str) -> Path:
     """Path of a shipped file or folder, e.g.  `shipped("catalogs", "stars.npz")`.
 
-    `parts` are the names of the path in the checkout.  Nothing is checked: a missing file is
-    reported when it is opened.
+    `parts` are the names of the path in the checkout.  A missing file is reported only when
+    it is opened.
     """
     inside = _PACKAGE / "_shipped"
     return (inside if inside.is_dir() else _PACKAGE.parent).joinpath(*parts)

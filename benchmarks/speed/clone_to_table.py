@@ -4,7 +4,7 @@
 
 The last commit of this tree and `BASE` in turns, each cloned into a folder of its own, with the
 Python that runs this.  A clone of either comes before and is not counted: what it downloads is
-there for the others.  What is not committed is not measured.  Without anything else on the
+there for the others.  Uncommitted changes are not measured.  Without anything else on the
 machine; an empty loop is timed beside it.
 """
 

@@ -55,7 +55,7 @@ class SearchResult(Struct, frozen=True, eq=False, gc=False):
 
     @property
     def unique(self) -> list[Mask]:
-        """For each tracker a mask (n,) of unique stars; `in_zones` must not be None."""
+        """Masks (n,) of the unique stars of each tracker; `in_zones` must not be None."""
         assert self.in_zones is not None
         return [each.unique for each in self.in_zones.identifications]
 

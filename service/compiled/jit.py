@@ -217,6 +217,7 @@ class _MachineCodeLibrary(JITCodeLibrary):
         collect(self)
         # Callers first: LLVM leaves out a function that nothing has called by then.
         self._linking_libraries = list(reversed(callees))
+        # numba gives its own methods no types; so below.
         super().finalize()  # type: ignore[no-untyped-call]
 
     def _get_module_for_linking(self) -> Any:

@@ -241,7 +241,7 @@ class LocalWorkers(Generic[Input, Output]):
             self._end_dismissed()
         self._end_dismissed()
         with self._lock:
-            # Nobody wakes it any more.
+            # No other thread can wake this one any more.
             self._is_woken = True
             woken.close()
             wake.close()

@@ -76,7 +76,7 @@ class Alarms:
             return alarm_spans(connection, run, spacecraft, start, end)
 
     def times_out(self, found: Sequence[Alarm]) -> list[list[TimeOut]]:
-        """For each alarm, the intervals in which it was out of limits; see `state.times_out`."""
+        """Intervals in which each alarm was out of limits; see `state.times_out`."""
         with self._context.reading() as connection:
             return times_out(connection, found)
 

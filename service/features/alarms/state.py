@@ -375,7 +375,7 @@ def alarm_spans(
 
 
 def times_out(connection: Connection, found: Sequence[models.Alarm]) -> list[list[TimeOut]]:
-    """For each alarm, the intervals of telemetry time in which its value was out of limits."""
+    """Intervals of telemetry time in which the value of each alarm was out of limits."""
     actions: dict[str, list[tuple[str, str | None]]] = {alarm.id: [] for alarm in found}
     noted = (
         select(alarm_actions.c.alarm_id, alarm_actions.c.action, alarm_actions.c.time)

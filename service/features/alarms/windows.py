@@ -51,7 +51,7 @@ class SampleWindow:
     samples: list[Sample] = field(default_factory=list)
     since_ns: dict[Severity, int] = field(default_factory=dict)
     worst: dict[Severity, Point] = field(default_factory=dict)
-    """For each exceeded severity, the value furthest beyond its bound since then."""
+    """Value furthest beyond the bound of each exceeded severity, since it was exceeded."""
     _known_within: LimitSettings | None = field(default=None, compare=False, repr=False)
     """Limits that each single sample of the window is known to be within."""
 

@@ -121,7 +121,7 @@ class PacketReader:
         """Batches and gyro blocks of a file, and a fault for each packet that cannot be read.
 
         A line has the number of its packet in the file.  A fault names the file, the packet, its
-        first byte and the parameter.  Nothing follows the damaged packet of a file.
+        first byte and the parameter.  A damaged packet is the last line of its file.
         """
         before = self._totals.packets
         try:

@@ -28,7 +28,7 @@ class Pictures:
         self._turn = threading.BoundedSemaphore(1)
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing: this part holds no file and no thread."""
 
     def solve(
         self,

@@ -50,7 +50,7 @@ async def _picture(request: Request, query: FromQuery[PictureQuery], app: AppDep
     "POST /pictures",
     # It records nothing; the handler asks for access to the spacecraft that is named.
     Policy("read", "nothing"),
-    Returns("What was found; nothing is recorded.", Picture),
+    Returns("Attitude, lens and stars of the picture. The service records none of it.", Picture),
     frame=True,
     problems=(404, 503),
 )

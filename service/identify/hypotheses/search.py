@@ -187,7 +187,7 @@ def _insert(seeds, last, at, k):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def _find_candidates(observed, pairs, scratch):  # type: ignore[no-untyped-def]
-    """For each pair of seeds: the separation, and the range of catalog pairs within tolerance."""
+    """Separation of each pair of seeds, and the range of catalog pairs within its tolerance."""
     seeds, direction, sigma_rad = scratch.seeds, observed.direction, observed.sigma_rad
     s = len(seeds)
     for x in range(s):

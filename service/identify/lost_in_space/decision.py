@@ -55,7 +55,7 @@ def decide(ledger, count):  # type: ignore[no-untyped-def]
 def star_probabilities(  # type: ignore[no-untyped-def]
     points, index, field, magnitude_gate, t, covariance, match, doubt
 ):
-    """For each point: its most likely star, probabilities of that and of no star, second star.
+    """Most likely star of each point, probabilities of it and of no star, and the second star.
 
     A point may be its match, the second star near its place, or clutter with the density of the
     unexplained points. `doubt` is the probability that the attitude is wrong, which reduces every

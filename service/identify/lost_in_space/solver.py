@@ -117,7 +117,7 @@ class LostInSpaceResult(NamedTuple):
 
 
 class StarChances(NamedTuple):
-    """For each point: likeliest star (-1: none), its probability, that of no star, second star."""
+    """Likeliest star of each point (-1: none), its probability, that of no star, second star."""
 
     star: Rows
     probability: Vector

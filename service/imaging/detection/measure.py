@@ -101,7 +101,7 @@ def measure(
 
 
 def _neighbours(found: Detections, count: int, reach_px: float) -> list[list[int]]:
-    """For each of the first `count` candidates, indices of others with light in its window.
+    """Indices of candidates with light in the window of each of the first `count` candidates.
 
     Bright stars whose images are already part of the background are not counted.
     """

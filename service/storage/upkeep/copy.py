@@ -41,7 +41,7 @@ def copy_record(
     """Copy a database to another one; returns the number of rows, and the faults of the copy.
 
     The target must be missing, empty, or an unfinished copy of the same source; SQLite's file and
-    all tables are created.  Nothing else may write to either database meanwhile.  Raises
+    all tables are created.  No other process may write to either database meanwhile.  Raises
     `BadConfiguration` with the remedy, also if the copy does not equal its source.
     """
     with _source(source) as reading, _target(target) as writing:
