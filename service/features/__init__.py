@@ -1,1 +1,1 @@
-"""Features, one folder each; see `service.feature`."""
+"""Package of features, optional subjects of the service, one folder each; see `service.feature`."""

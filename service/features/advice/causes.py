@@ -51,7 +51,7 @@ FALSE_SHARE = 0.02
 USUAL_SHARE = 0.15
 """Normal share of batches with a priori errors beyond the zone, not reported as a cause."""
 OVER_SHARE, OVER_BATCHES = 0.1, 6
-"""Share of the period and number of last batches free of a cause after which the cause is over."""
+"""Last batches without a cause after which it is over: a share of all, but at least a number."""
 COMMON = 5
 
 Flags = npt.NDArray[np.bool_]
@@ -469,7 +469,7 @@ class Part:
 
     @property
     def is_certain(self) -> bool:
-        """True if the change is significant: neither interval holds the other period's share."""
+        """True if the change is significant: the 95 % intervals of both periods do not overlap."""
         return self.before is not None and (
             self.share.low > self.before.high or self.share.high < self.before.low
         )

@@ -209,7 +209,7 @@ def _tracker_attitude(
 
 
 def _joined(kind: type[_Columns], parts: Sequence[_Columns]) -> _Columns:
-    """Concatenate the columns of several parts; empty columns without parts."""
+    """Concatenate the columns of several objects of a class; without any, the columns are empty."""
     return kind(**{each.name: _column(each.name, parts) for each in fields(kind)})
 
 

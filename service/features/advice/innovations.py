@@ -36,16 +36,16 @@ from service.missions.motion import GyroSettings
 from service.vectors import Vector, full_matrices
 
 MOST = 20_000
-"""Greatest number of measurements, the latest ones, that are used to bound the computing time."""
+"""Greatest number of measurements used, the latest ones; this bounds the computing time."""
 LEAST = 300
 SEGMENTS = 20
-"""Number of consecutive parts; leaving out one at a time (jackknife) gives the interval."""
+"""Number of consecutive parts of the measurements; each is left out once (jackknife)."""
 STUDENT = 2.093
 """The 97.5 % point of Student's t with 19 degrees of freedom."""
 LONGEST_STEPS = 3.0
 """Longest step, in median steps, across which the noise of the gyro is estimated."""
 SETTLING = 4.0
-"""Number of measurements to skip after a break while A and B settle, in multiples of 1 / K."""
+"""Number of measurements skipped after a break until the equations settle, in 1 / gain."""
 
 Full = npt.NDArray[np.float64]
 
@@ -111,7 +111,7 @@ def _latest(parts: Sequence[MeasuredInnovations]) -> list[MeasuredInnovations]:
 def _segment_sums(
     parts: Sequence[MeasuredInnovations],
 ) -> tuple[Full, Full, int] | None:
-    """Left matrices (segments, 2, 2) and right sides (segments, 2) of both equations by segment."""
+    """Left (s, 2, 2) and right sides (s, 2) of two equations by segment; measurements used."""
     used = [part for whole in parts for part in _unbroken(whole)]
     if not used:
         return None
@@ -145,7 +145,7 @@ def _principal_axes(parts: Sequence[MeasuredInnovations]) -> Full:
 
 
 def _rows(part: MeasuredInnovations, axes: Full) -> Iterator[list[float]]:
-    """Coefficients and right sides of two equations per measurement, summed over three axes."""
+    """Six coefficients of two linear equations per settled measurement, summed over three axes."""
     z = part.innovation_arcsec @ axes
     predicted, measured = (
         np.einsum("ji,njk,ki->ni", axes, full_matrices(each), axes)
@@ -164,7 +164,7 @@ def _rows(part: MeasuredInnovations, axes: Full) -> Iterator[list[float]]:
 def _axis_rows(
     z: Sequence[float], s: Sequence[float], r: Sequence[float]
 ) -> Iterator[tuple[float, ...] | None]:
-    """The two equations for each measurement about one axis; None until A and B have settled."""
+    """Six coefficients of two equations per measurement about one axis; None until they settle."""
     usual = sorted(1.0 - b / a for a, b in zip(s, r, strict=True))[len(s) // 2]
     settling = SETTLING / max(usual, 1e-6)
     a = b = 0.5 * (s[0] - r[0])

@@ -82,7 +82,7 @@ MOST_COSTS = 1_000
 
 
 class ZoneSizes:
-    """Advice on the sizes of zones from recorded a priori errors; it keeps the costs of sizes."""
+    """Advises on the sizes of zones from recorded a priori errors, and caches their costs."""
 
     def __init__(self, context: Context) -> None:
         self._context = context
@@ -109,7 +109,7 @@ class ZoneSizes:
         return size, partial(self._cost, mission, run_catalog)
 
     def _cost(self, mission: Mission, run_catalog: RunCatalog, size_deg: float) -> ZoneCost:
-        """The cost of a zone of this size; searching the whole sky takes up to seconds."""
+        """Counts of stars and pairs in zones of a size, cached; counting takes up to seconds."""
         key = mission.digest, run_catalog.digest, size_deg
         if key not in self._costs:
             if len(self._costs) >= MOST_COSTS:
@@ -128,7 +128,7 @@ class AdviceService:
         self._lock = threading.Lock()
 
     def close(self) -> None:
-        """Do nothing: no file and no thread is open."""
+        """Do nothing on closing: no file and no thread is open."""
 
     def ambiguity(
         self, name: str, run: str, start: Utc, end: Utc, earlier_s: float = DAY_S

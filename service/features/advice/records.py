@@ -138,7 +138,7 @@ class Trial(Record, frozen=True, kw_only=True):
     ambiguous: Count
     unmatched: Count
     named_otherwise: Count
-    """Stars unique both in this trial and under `verified`, but as different catalog stars."""
+    """Number of stars unique here and under `verified`, but as different catalog stars."""
     change_points: Estimate | None
     """Change of the share of stars that are not unique, in percentage points, relative to votes
     with     the present settings; null: not compared.

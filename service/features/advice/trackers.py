@@ -21,7 +21,7 @@ CLOSE = 0.2
 CERTAIN = 0.999
 """Confidence of the intervals that show a change of noise; high, since several are tested."""
 SCAN_SIGMAS = 4.5
-"""Threshold in sigmas for a noisier period; constant noise passes in 1 of 500 samples of 200."""
+"""Threshold in sigmas for a noisier period; constant noise exceeds it in 1 of 500 samples."""
 
 SizeVerdict = Literal["too_small", "fits", "too_large", "no_verdict"]
 
@@ -140,8 +140,7 @@ def _noise_period(
 
 
 def _worst_in_a_row(squared: vectors.Vector) -> slice | None:
-    """Run of consecutive batches with significantly more noise than the rest; None if there is
-    none.
+    """Slice of consecutive batches with clearly more noise than the rest; None if there is none.
 
     The rank sum of each run is compared with its expectation (Mann & Whitney); the search is one
     step of circular binary segmentation (Olshen et al. 2004).

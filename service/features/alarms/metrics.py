@@ -16,7 +16,7 @@ ALARM_STATES = ("open", "acknowledged", "shelved")
 
 
 def reads(app: App) -> Mapping[str, Callable[[], Any]]:
-    """Database query for the active alarms, read before metrics are collected."""
+    """Function that reads the active alarms from the database for the metrics, by its name."""
     return {"alarms": app.part(Alarms).active}
 
 

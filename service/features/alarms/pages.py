@@ -242,7 +242,7 @@ def alarm_page(id: str, query: FromQuery[AlarmQuery], context: ContextDep) -> Re
 
 
 def _has_tracker(context: PageContext, alarm: Alarm) -> bool:
-    """True if the alarm is about a tracker with recorded history."""
+    """True if the alarm is about a tracker that has, or had, values of its own."""
     known = alarm.spacecraft in context.app.context.known
     return known and alarm.tracker in context.app.context.trackers(alarm.spacecraft)
 
@@ -286,7 +286,7 @@ class AlarmTrend:
 
 
 def _trend(context: PageContext, alarm: AlarmWithActions) -> AlarmTrend | None:
-    """Chart of an alarm's quantity about its raise; None for a quantity without history."""
+    """Chart of an alarm's quantity about its raise; None without a history of the quantity."""
     if alarm.quantity not in trend_names() or alarm.spacecraft not in context.app.context.known:
         return None
     if alarm.tracker is not None and not _has_tracker(context, alarm):

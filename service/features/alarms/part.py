@@ -32,7 +32,8 @@ from service.trends.quantities import (
 
 
 class Alarms:
-    """Reads alarms and changes their state.  `entry` is the audit entry written with a change.
+    """Service that reads alarms and changes their state. `entry` is the audit entry written with a
+    change.
 
     `limits` manages the limits that raise alarms.
     """
@@ -42,7 +43,7 @@ class Alarms:
         self.limits = Limits(context)
 
     def close(self) -> None:
-        """Do nothing: this part starts no thread and holds no file."""
+        """Do nothing on closing: this part has no thread and no file."""
 
     def page(
         self,
@@ -176,7 +177,7 @@ MOST_EXCURSIONS = 50
 
 
 class Limits:
-    """Reads and sets the limits of spacecraft."""
+    """Service that reads and sets the limits of spacecraft."""
 
     def __init__(self, context: Context) -> None:
         self._context = context
@@ -311,7 +312,7 @@ def _trial(
 def _checked_tracker(
     mission: Mission, tracker: str | None, quantity: QuantityName | None = None
 ) -> str:
-    """Check the tracker whose limits are asked; empty for limits of the whole spacecraft.
+    """Name of the tracker whose limits are asked, checked; empty for those of the spacecraft.
 
     Raises `BadInput` for a tracker without limits of its own, and for a quantity that trackers do
     not have.

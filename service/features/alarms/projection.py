@@ -65,7 +65,7 @@ class LimitEvaluator:
         self._spacecraft, self._run = spacecraft, run
         self._new = new
         self._latest: dict[Subject, tuple[int, BatchRef]] = {}
-        """The latest batch of a window and its time, as far as the new batches tell."""
+        """Time and reference of the latest batch in a subject's sample window, as far as known."""
         self._earlier: dict[int, BatchRef | None] = {}
         mission = recorded_mission(connection, new[0].result["mission_digest"])
         self._limits = limits_of(connection, mission)
@@ -130,7 +130,7 @@ class LimitEvaluator:
             self._active.observe(SILENCE, None, limits, Point(0.0, *latest), now)
 
     def _due(self) -> list[tuple[Subject, LimitSettings]]:
-        """Subjects that need an evaluation batch by batch; all others are evaluated at once.
+        """Subjects to be evaluated batch by batch, with their limits; evaluates all others at once.
 
         Most quantities stay in limits, and evaluating every batch by itself takes as long as
         recording it.  An alarm that is back in limits needs only the latest value: nothing is

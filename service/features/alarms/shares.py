@@ -24,7 +24,7 @@ def evaluate_day(connection: Connection, mission: Mission, day: SampledDay) -> N
     excursions = preview_of(samples, limits).excursions
 
     def at(time_ns: int, value: float | None = None) -> Point:
-        """Point at a time with a value; by default the mean over the latest samples."""
+        """Point of a value at a time (TAI, ns); by default the mean over the latest samples."""
         if value is None:
             parts = [part for at_ns, part, _ in samples if at_ns <= time_ns]
             value = sum(parts[-limits.minimum_count :]) / limits.minimum_count

@@ -53,7 +53,7 @@ class SampleWindow:
     worst: dict[Severity, Point] = field(default_factory=dict)
     """Value furthest beyond the bound of each exceeded severity, since it was exceeded."""
     _known_within: LimitSettings | None = field(default=None, compare=False, repr=False)
-    """Limits that each single sample of the window is known to be within."""
+    """Limits that every single sample of the window is known to be within; None: not known."""
 
     def add(
         self, sample: Sample, limits: LimitSettings, latest: BatchRef = ("", None)
@@ -122,7 +122,7 @@ class SampleWindow:
         return worst
 
     def _was_out(self, severity: Severity, limits: LimitSettings) -> bool:
-        """True if a severity's bound is exceeded up to now; a wider bound must be passed first."""
+        """True if a severity's bound is exceeded up to now, also the bound as it is set now."""
         if severity not in self.since_ns:
             return False
         worst = self.worst.get(severity)
@@ -160,7 +160,7 @@ def _all_within(values: Sequence[float], limits: LimitSettings) -> bool:
 
 
 def _means(samples: Sequence[Sample], count: int, known: int) -> list[float]:
-    """Means over the latest `count` samples at each sample after the first `known` ones.
+    """Means over `count` consecutive samples that end after the first `known` ones, and two bounds.
 
     The least and the greatest mean are widened by the rounding error of differences of running
     sums.
@@ -255,7 +255,7 @@ def _count_beyond(values: Vector, limits: LimitSettings, severity: Severity) -> 
 def _evaluated(
     values: Vector, time_ns: Vector, limits: LimitSettings
 ) -> Iterator[tuple[int, Evaluated]]:
-    """Evaluate a series, skipping stretches within limits; yields the remaining values."""
+    """Evaluate a series in order of time; yields its values except in stretches within limits."""
     low, high = limits.inner_bounds
     out = np.flatnonzero((values < low) | (values > high))
     window = SampleWindow()

@@ -1,4 +1,4 @@
-"""Normal equations with the attitudes eliminated, and the test which unknowns are observable.
+"""Normal equations with the attitudes eliminated, and a test of which unknowns are observable.
 
 The attitude of a batch affects its own stars only.  Eliminating it block by block (Schur
 complement) leaves a small system of the unknowns alone, equivalent to a least squares over all
@@ -44,7 +44,7 @@ class Normal:
         return Normal(*(one - another for one, another in pairs))
 
     def solution(self, free: Indices) -> Vector:
-        """Step (p,) of the normal equations, zero except for the unknowns `free`."""
+        """Solve the equations for the unknowns `free`; the step (p,) of all others is zero."""
         step = np.zeros(len(self.right))
         if len(free):
             inner = self.matrix[np.ix_(free, free)]
@@ -81,7 +81,7 @@ class Eliminated:
     def steps(
         self, normal: Normal, residual: Vector, weight: Weights, free: Indices
     ) -> tuple[Vector, Vector, float]:
-        """Steps of the unknowns (p,) and of the attitudes (K, 3) for weighted residuals (2, n).
+        """Solve for steps of unknowns (p,) and attitudes (K, 3), given weighted residuals (2, n).
 
         The matrix is that of `normal`, whatever weights it was built with.  The third value is the
         length of the step in sigmas: of all unknowns, or rms over the attitudes if there are none.
@@ -130,7 +130,7 @@ def eliminate(
     edges: Indices,
     attitudes_known: bool = False,
 ) -> Eliminated:
-    """Build the normal equations of all stars (n) from `residual` (2, n) and `weight` (n,).
+    """Normal equations of each block of batches, attitudes eliminated unless they are known.
 
     `edges` (f + 1,) are the first batches of the blocks, and the number of batches at the end.
     """
@@ -171,7 +171,7 @@ def eliminate(
 
 
 def _normals(matrix: Matrix, full: Matrix) -> tuple[Normal, ...]:
-    """Normal equations from blocks (f, p + 1, p + 1); the last row is that of the residuals."""
+    """Normal equations from blocks (f, p + 1, p + 1), with residuals as last row and column."""
     return tuple(
         Normal(block[:-1, :-1], -block[:-1, -1], float(block[-1, -1]), own)
         for block, own in zip(matrix, full, strict=True)

@@ -396,7 +396,7 @@ def _free(settled: Fit, degree: int) -> Indices:
 
 
 def _predicted_squares(by_block: list[Normal], free: Indices) -> Vector:
-    """Sum of squares of each block, predicted with unknowns from the other blocks."""
+    """Sum of squared residuals of each block (f,), predicted by unknowns from the other blocks."""
     total = sum(by_block[1:], start=by_block[0])
     if len(by_block) == 1:
         return np.array([total.squares])
@@ -404,7 +404,7 @@ def _predicted_squares(by_block: list[Normal], free: Indices) -> Vector:
 
 
 def _no_worse(excess: Vector) -> bool:
-    """True if the sum of excess squares over blocks is within one standard error."""
+    """True if the sum of excess squares (f,) over blocks is at most one standard error."""
     n = len(excess)
     error = float(np.std(excess, ddof=1)) * math.sqrt(n) if n > 1 else 0.0
     return float(excess.sum()) <= error

@@ -76,7 +76,7 @@ class CalibrationRequest:
     sample: int = CALIBRATION_SAMPLE
 
     def require(self, mission: Mission, trackers_field: str = "trackers") -> None:
-        """Raise `BadInput` for trackers that the mission lacks, or a model without unknowns."""
+        """Raise `BadInput` for an unknown tracker, a bad degree, or a model without unknowns."""
         for name in self.trackers:
             mission.tracker(name, trackers_field)
         if self.degree is not None and not 0 <= self.degree <= LARGEST_DEGREE:

@@ -212,7 +212,7 @@ class Linearised:
 
     @property
     def flat(self) -> Vector:
-        """Derivatives by the unknowns, reshaped to a matrix (q, 2 n)."""
+        """Derivatives of residuals by the unknowns, reshaped to a matrix (q, 2 n)."""
         count, angles, n = self.by_unknown.shape
         return self.by_unknown.reshape(count, angles * n)
 

@@ -225,7 +225,7 @@ def _beyond(names: Sequence[str], line: _Line) -> list[str]:
 
 
 def _with_spread(columns: dict[str, Vector], star: Indices) -> list[str]:
-    """Names of the magnitude unknowns whose columns vary enough between stars to be estimated."""
+    """Names of magnitude unknowns that the spread of the stars determines; none with few stars."""
     _, first = np.unique(star, return_index=True)
     if len(first) < LEAST_STARS:
         return []

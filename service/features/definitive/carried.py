@@ -128,7 +128,7 @@ def _end_ns(stretch: Stretch) -> int:
 
 
 def _epochs(stretch: Stretch) -> Nanoseconds:
-    """Times at which the filter's input may be divided."""
+    """Times of samples or measurements, at which the filter's input may be divided."""
     if stretch.gyro is not None:
         return stretch.gyro.tai_ns
     return np.union1d(stretch.attitudes.tai_ns, stretch.directions.tai_ns)

@@ -69,7 +69,7 @@ def joined_moments(time_ns: Integers, axis: TimeAxis, parts: int, same: Mask) ->
 
 
 def scale_of(values: Mapping[str, Vector], *, is_log: bool = False) -> Scale | None:
-    """Vertical scale that includes all finite values; None without any."""
+    """Vertical scale of all finite (logarithmic: positive) values; None without any."""
     found = np.concatenate([each[np.isfinite(each)] for each in values.values()])
     if is_log:
         found = found[found > 0.0]

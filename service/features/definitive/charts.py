@@ -107,7 +107,7 @@ def direction_chart(found: DefinitivePeriod, axis: TimeAxis, tracker: Tracker) -
 
 
 def _attitude(found: DefinitivePeriod, axis: TimeAxis) -> Chart | None:
-    """Chart of the rotation from the first good smoothed attitude."""
+    """Chart of the rotation since the first good smoothed attitude, or else the first known one."""
     samples = found.samples["smoothed"]
     known = _known(samples.status)
     if not known.any():
@@ -315,7 +315,7 @@ def _median(values: Vector) -> float:
 
 DEGREES = 3
 INSIDE = 0.95
-"""Expected share of measurements between the two lower bounds if covariances are right."""
+"""Probability that chi-square lies between its two lower limits, if covariances are right."""
 
 
 @lru_cache(maxsize=1)

@@ -103,7 +103,7 @@ def _carried_rates(
     gyro_ns: Nanoseconds,
     rates_read: RatesRead,
 ) -> Vector | None:
-    """Body rates sent with batches, see `Recorded`; zeros near gyro samples, which are better.
+    """Body rates (n, 3) sent with batches, zero near gyro samples; None if all are zero.
 
     `gyro_ns` are the times of samples that are not zero about all axes.  Rates of other batches are
     removed from the cache `rates_read`.

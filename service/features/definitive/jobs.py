@@ -59,7 +59,7 @@ class DefinitiveJobs:
         self._stopped = threading.Event()
         self._schedule: threading.Thread | None = None
         self._made: dict[str, int] = {}
-        """By spacecraft, the day up to which its schedule has been followed."""
+        """Day up to which the schedule of each spacecraft has been followed."""
 
     def begin(
         self,

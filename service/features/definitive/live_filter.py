@@ -38,7 +38,7 @@ class _Kept:
     rates_read: RatesRead = field(default_factory=dict)
     version: tuple[int, str | None] | None = None
     forgotten: str | None = None
-    """Last audit entry about the removal of recorded batches or gyro blocks."""
+    """Id of the last audit entry about the removal of recorded batches or gyro blocks."""
     attitude: LiveAttitude | None = None
 
 

@@ -92,7 +92,7 @@ RATE_SIGMAS = 3.0
 
 
 def rates_of_use(model: ConstantRateModel, tai_ns: Nanoseconds, carried_rad_s: Vector) -> bool:
-    """True if attitudes at times (m,) are too sparse to determine rotation at rates (m, 3).
+    """True if sent rates (m, 3) must be used, as attitudes at times (m,) do not show the rotation.
 
     The filter does not expect such a fast rotation; and with more than a quarter turn between two
     attitudes, the number and the sense of the turns stay open.
@@ -121,7 +121,7 @@ def arrays_of(
 def usable_attitudes(
     tai_ns: Nanoseconds, quaternion: Vector, covariance_arcsec2: Vector
 ) -> tuple[AttitudeMeasurements, Mask]:
-    """Attitudes with a valid covariance, and their mask (m,).
+    """Usable attitudes, with a valid quaternion and covariance, and the mask (m,) of these.
 
     `covariance_arcsec2` (m, 6) is the upper triangle: 11, 12, 13, 22, 23, 33.
     """
@@ -231,7 +231,7 @@ def _without_gyro(
     left_d: Mask,
     edges: list[int],
 ) -> Iterator[tuple[Mask, Mask]]:
-    """Masks of remaining attitudes and directions, for each interval without a gyro."""
+    """Masks of measured attitudes and of directions for each interval without gyro samples."""
     times = np.union1d(attitude_ns[left_a], direction_ns[left_d])
     # Between two of the same stretch lies no stretch with a gyro.
     place = np.searchsorted(np.asarray(edges, dtype=np.int64), times)

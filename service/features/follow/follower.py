@@ -135,7 +135,7 @@ class Follower:
         metrics: Metrics,
         progress: Callable[[Metrics], object] = lambda metrics: None,
     ) -> None:
-        """Keep the collaborators; `progress` is called every few seconds."""
+        """Prepare to follow a stream; `progress` is called with the counters every few seconds."""
         self._source, self._submit = source, submit
         self._metrics, self._progress = metrics, progress
         self._stopped = asyncio.Event()
@@ -418,7 +418,7 @@ def _size_of(headers: Mapping[str, str]) -> int:
 
 
 def _covers(patterns: Iterable[str], subject: str) -> bool:
-    """True if a NATS subject matches a pattern, with `*` for a token and `>` for the rest."""
+    """True if a NATS subject matches one of the patterns: `*` is a token, `>` all further ones."""
     return any(_matches(pattern.split("."), subject.split(".")) for pattern in patterns)
 
 

@@ -24,7 +24,7 @@ STATE_FIELDS = {
 }
 """Tables of `[packets]` for the spacecraft's state, and the batch fields that they fill."""
 SCALES = {"rad_per_s": 180.0 / math.pi, "m_per_s": 1e-3, "m": 1e-3}
-"""Factors from a unit to degrees per second or kilometres; 1 for units not listed."""
+"""Factors from a unit to deg/s, km/s or km; 1 for units not listed."""
 
 Values = Mapping[str, Any]
 
@@ -92,7 +92,7 @@ class GyroRates:
         self._last: tuple[int, tuple[int, ...]] | None = None
 
     def add(self, values: Mapping[str, Any], moment: clock.Moment) -> list[float] | None:
-        """Body rates in deg/s at a packet; None for an angle without a recent packet before."""
+        """Body rates in deg/s at a packet; None if its angle has no recent predecessor."""
         gyro = self._gyro
         if gyro.kind == "rate":
             counts = clock.finite_all(values, self._names)
@@ -119,7 +119,7 @@ class Held:
         self._values: list[float] | None = None
 
     def hold(self, moment: clock.Moment, values: list[float] | None) -> None:
-        """Replace the held values; None if the packet has none."""
+        """Replace the held values and their time; values None: the packet has none."""
         self._moment, self._values = moment, values
 
     def near(self, moment: clock.Moment) -> list[float] | None:
@@ -142,10 +142,10 @@ class BatchMaker:
         self._state = {name: Held(CARRIED_WITHIN_S) for name in STATE_FIELDS}
         self._pending: StarBatch | None = None
         self.without_attitude = 0
-        """Packets whose a priori quaternion was zero or not finite."""
+        """Number of packets whose a priori quaternion was zero or not finite."""
 
     def attitude(self, values: Values) -> PacketAttitude | None:
-        """A priori attitude in a packet, None without one; raises `PacketFault`."""
+        """A priori attitude in a packet, None without a usable one; raises `PacketFault`."""
         names, prior = self._mapped.quaternion, self._prior
         if not names or prior is None or names[0] not in values:
             return None
@@ -244,7 +244,7 @@ class BatchMaker:
     def _stars(
         self, columns: TrackerColumns, values: Values
     ) -> tuple[list[int], list[dict[str, Any]]]:
-        """Indices of the slots that hold a star, and the stars."""
+        """Indices of a tracker's slots that hold a star, and these stars as JSON objects."""
         used = columns.slots
         if columns.count is not None:
             used = clock.whole(values, columns.count)

@@ -130,7 +130,7 @@ class GyroBlockMaker:
         return _Sample(tai_ns, tuple(finite(values, name) for name in names))
 
     def _rates(self, found: list[_Sample]) -> list[tuple[_Sample, Axes]]:
-        """Samples with their rates; an angle without a previous sample gives no rate."""
+        """Samples with their rates; an angle without a recent previous sample is left out."""
         rates = []
         before = self._before
         for sample in found:

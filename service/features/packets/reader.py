@@ -64,28 +64,28 @@ class PacketTotals(Struct, kw_only=True):
     bytes: int = 0
     batches: int = 0
     without_stars: int = 0
-    """Packets of a tracker without a star or an attitude."""
+    """Number of packets of a tracker without a star or an attitude."""
     gyro_blocks: int = 0
     gyro_samples: int = 0
     unknown: int = 0
-    """Packets that the XTCE file does not describe."""
+    """Number of packets that the XTCE file does not describe."""
     not_asked: int = 0
-    """Packets of APIDs that the mission's table leaves out."""
+    """Number of packets of APIDs that the mission's table leaves out."""
     idle: int = 0
     gaps: int = 0
     missing: int = 0
     backward: int = 0
     joined: int = 0
-    """Packets that were joined of segments."""
+    """Number of packets that were joined of segments."""
     incomplete: int = 0
-    """Segments of packets whose other segments are missing."""
+    """Number of segments of packets whose other segments are missing."""
     refused: int = 0
     unread_bytes: int = 0
-    """Bytes after a damaged packet, from which files could not be read any further."""
+    """Number of bytes after a damaged packet, from which files could not be read any further."""
     empty_files: int = 0
-    """Files without a packet."""
+    """Number of files without a packet."""
     without_attitude: int = 0
-    """Packets whose a priori quaternion was zero or not finite."""
+    """Number of packets whose a priori quaternion was zero or not finite."""
     apids: list[ApidCounts] = []
 
 

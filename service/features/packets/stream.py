@@ -83,7 +83,7 @@ class EndOfPackets(PacketFault):
         self.number = number
         self.offset = offset
         self.read = read
-        """Bytes that were read from the offset on."""
+        """Number of bytes that were read from the offset on."""
 
 
 def packets_in(stream: IO[bytes], prefix_bytes: int = 0) -> Iterator[SpacePacket]:
@@ -150,7 +150,7 @@ class ApidCounts(Struct, kw_only=True):
     backward: int = 0
     """Number of places where the count repeats or goes back: a reset, or packets out of order."""
     incomplete: int = 0
-    """Segments of packets whose other segments are missing."""
+    """Number of segments of packets whose other segments are missing."""
     refused: int = 0
 
 
@@ -187,7 +187,7 @@ class SegmentJoiner:
         return self._joined([*before, packet]), []
 
     def end(self) -> list[SpacePacket]:
-        """Remaining segments of packets without an end."""
+        """Remove and return the segments of packets whose last segment has not come."""
         left = [packet for segments in self._open.values() for packet in segments]
         self._open.clear()
         return left

@@ -101,7 +101,7 @@ class PacketFiles:
         return archive_of([self._parsed.xtce, *self.files])
 
     def item(self, number: int) -> "Item":
-        """A packet by its number; with several files the problem's message names the file."""
+        """Place of a refused batch or block, by its number and the first of the files."""
         from service.replay.items import Item
 
         return Item(self.files[0], number, None)

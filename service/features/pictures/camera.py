@@ -74,7 +74,7 @@ def run(parsed: Namespace) -> int:
 def _solved(
     parsed: Namespace, settings: "Settings", sky: "BrightStars", solver: "BlindSolver"
 ) -> list["PictureResult"]:
-    """Pictures for which an attitude was found; for the others the reason is printed."""
+    """Solve the pictures; reports those without an attitude or mirrored, and returns the others."""
     from service.acquire.picture import solve_picture
     from service.features.pictures.any_camera import focal_guess_px, picture_reader
 

@@ -1,4 +1,4 @@
-"""The page of pictures."""
+"""Console page that solves pictures of any camera."""
 
 from starlette.responses import Response
 
@@ -11,7 +11,7 @@ _POLICY = HEADERS["Content-Security-Policy"].replace("img-src 'self'", "img-src 
 
 @console_page("/pictures", "Pictures", Policy("read", "nothing"), position=60)
 def pictures_page(query: FromQuery[PageQuery], context: ContextDep) -> Response:
-    """Drop a picture: its attitude, stars and lens, and what to try if there are none."""
+    """Page on which a dropped picture is solved: its attitude, stars and lens, or what to try."""
     missions = context.app.missions
     cameras = [
         (name, tracker.camera)

@@ -16,7 +16,7 @@ from service.missions.mission import mission_named
 from service.vectors import Projection
 
 WAIT_S = 30.0
-"""Longest wait of a picture for its turn in seconds: others may take seconds."""
+"""Longest wait of a picture for its turn, in seconds: each one before it may take seconds."""
 _COMMAND_OPTION = re.compile(r" \(--[^)]*\)")
 
 
@@ -28,7 +28,7 @@ class Pictures:
         self._turn = threading.BoundedSemaphore(1)
 
     def close(self) -> None:
-        """Do nothing: this part holds no file and no thread."""
+        """Do nothing on closing: this part has no file and no thread."""
 
     def solve(
         self,

@@ -1,4 +1,4 @@
-"""The route of pictures of any camera."""
+"""API route that solves pictures of any camera."""
 
 from typing import IO, Annotated
 

@@ -30,7 +30,7 @@ def file_suffix(name: str) -> str:
 
 
 def write_attitudes(name: str, series: "AttitudeSeries") -> Iterator[bytes]:
-    """Write attitudes in a format, in pieces; raises `NotAvailable` if a package is missing."""
+    """Write attitudes in pieces; raises for a missing package, a wrong order, or no attitude."""
     written = attitude_formats()[name]
     written.require(name)
     if series.about.newest_first and not written.any_order:

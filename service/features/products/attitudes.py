@@ -192,7 +192,7 @@ class _Assembler:
         self._emitted = 0
 
     def fed(self, page: AttitudeRows) -> AttitudeBlock:
-        """Rows that are complete after a new page; may be empty."""
+        """Add a page of attitudes; returns the rows that are complete now, perhaps none."""
         is_wanted = _among(page.status, self._wanted)
         gaps = self._unwanted + np.cumsum(~is_wanted)
         self._unwanted = int(gaps[-1]) if len(gaps) else self._unwanted
@@ -202,7 +202,7 @@ class _Assembler:
         return self._finished(rows, waiting=2)
 
     def rest(self) -> AttitudeBlock | None:
-        """Rows that still waited at the end; None if there were none."""
+        """Rows that still wait after the last page of attitudes; None if there are none."""
         if self._held is None or len(self._held) == self._emitted:
             return None
         return self._finished(self._held, waiting=0)

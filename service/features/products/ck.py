@@ -54,7 +54,7 @@ def write_ck(series: attitudes.AttitudeSeries) -> Iterator[bytes]:
 
 
 def _clock(about: attitudes.SeriesInfo) -> str:
-    """Clock kernel (SCLK) of the spacecraft: its own, or the one defined here."""
+    """Text of the spacecraft's clock kernel (SCLK): its own file, or one made here."""
     if about.sclk_kernel is None:
         return clock_kernel(about)
     try:
@@ -99,7 +99,7 @@ def _run_child(place: Path, file: str, instrument: int, its_clock: list[str]) ->
 # 1972-01-01T00:00:00 TAI, an encoded tick being a microsecond.
 
 _CLOCK_ZERO_S = -883_656_000
-"""Zero of the clock in TAI seconds since 2000-01-01T12:00:00."""
+"""Zero of the service's own clock in TAI seconds since 2000-01-01T12:00:00."""
 _TT_LESS_TAI_S = 32.184
 
 
@@ -109,12 +109,12 @@ def clock_ticks(tai_ns: Integers) -> Vector:
 
 
 def body_name(about: attitudes.SeriesInfo) -> str:
-    """Name of the spacecraft in kernels: capitals, digits and underscores."""
+    """Name of the spacecraft in SPICE kernels: capitals, digits and underscores."""
     return re.sub("[^A-Z0-9]", "_", about.spacecraft.upper())[:20]
 
 
 def frame_name(about: attitudes.SeriesInfo) -> str:
-    """Name of the spacecraft's body frame in kernels."""
+    """Name of the spacecraft's body frame in SPICE kernels."""
     return f"{body_name(about)}_BODY"
 
 

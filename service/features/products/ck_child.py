@@ -38,7 +38,7 @@ def pieces(begins: "np.ndarray[tuple[int, int], np.dtype[np.int64]]", count: int
 
 
 def segments(parts: list[Piece]) -> Iterator[list[Piece]]:
-    """Group pieces into segments, each entirely with or entirely without rates."""
+    """Group pieces into segments of limited size, each entirely with or without rates."""
     group: list[Piece] = []
     for part in parts:
         size = part[1] - (group[0][0] if group else part[0])

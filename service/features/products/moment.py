@@ -96,7 +96,7 @@ def _nearest(
 
 
 def _interpolated(rows: attitudes.AttitudeBlock, after: int, moment: Utc) -> AttitudeAt | None:
-    """Attitude interpolated between two rows; None if the turn between them is ambiguous."""
+    """Attitude interpolated between two rows; None if the error due to motion may be too large."""
     pair = [after - 1, after]
     first_ns, second_ns = rows.time_ns[pair].tolist()
     share = np.array([(moment.tai_ns - first_ns) / (second_ns - first_ns)])

@@ -61,7 +61,7 @@ class GradeOfFile:
 
     @property
     def is_shattered(self) -> bool:
-        """True if a file has more intervals than a tenth of its attitudes."""
+        """True if a file has several intervals, and more than a tenth as many as attitudes."""
         return self.stretches * FEW_PER_STRETCH > self.attitudes and self.stretches > 1
 
 

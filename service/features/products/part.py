@@ -50,7 +50,7 @@ class Products:
         self._store = store
 
     def close(self) -> None:
-        """Do nothing: no file and no connection is open."""
+        """Do nothing on closing: no file and no connection is open."""
 
     def attitudes(
         self,

@@ -75,7 +75,7 @@ def _on_sky(points: Points, own: Indices, *, moves: bool) -> Motion:
 
 
 def _resting(points: Points, found: Link, batches: Batches) -> Track:
-    """Track of points at rest on the detector; also at rest on the sky if pointing was kept."""
+    """Classify points at rest on the detector: fixed there, a planet, or also fixed on the sky."""
     own = found.own
     motion = _on_sky(points, own, moves=True)
     on_detector = Track("fixed_on_detector", motion, own, found.log10_expected)
@@ -103,7 +103,7 @@ def _moving(points: Points, found: Link, batches: Batches) -> Track:
 
 
 def _is_good(motion: Motion) -> bool:
-    """True if the points fit one motion: chi-square within four sigmas of its mean."""
+    """True if the points fit one motion: chi-square is at most four sigmas above its mean."""
     degrees = motion.degrees_of_freedom
     return motion.chi_square < degrees + SIGMAS * math.sqrt(2.0 * degrees)
 

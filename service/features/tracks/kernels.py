@@ -21,7 +21,7 @@ MOST_CHANCE = 0.2
 
 
 class Sightings(NamedTuple):
-    """Input arrays of the kernel: points (n) of batches (b).
+    """Arrays of points (n) in batches (b), the input of the compiled search for tracks.
 
     The points of each batch begin at `first` (b + 1,).  `variance` (n,) is rad^2 along the worse
     axis, `density` (n,) points per steradian.  `used` (n,) marks points of other tracks.  `chosen`
@@ -169,7 +169,7 @@ def try_seeds(  # type: ignore[no-untyped-def]
 
 
 def compile_kernels() -> None:
-    """Compile the kernels by following one point through four batches."""
+    """Compile the kernels of the track search by following one point through four batches."""
     number = np.arange(4)
     time_s = number.astype(np.float64)
     places = np.stack([np.cos(time_s * 1e-4), np.sin(time_s * 1e-4), np.zeros(4)], axis=1)

@@ -383,7 +383,7 @@ def link(points: Points, batches: int, *, rests: bool = False) -> Iterator[Link]
 
 
 def _end(points: Points, i: int, chosen: Indices, count: int) -> int:
-    """End of the batches that a motion was followed over; later entries of `chosen` are stale."""
+    """Index after the last batch with a point of a motion; later entries of `chosen` are stale."""
     taken = np.flatnonzero(chosen[points.batch[i] :] >= 0)
     return int(points.batch[i] + taken[count - 1] + 1)
 

@@ -15,7 +15,7 @@ MOST_LINKED = 600
 def tracks_of_period(
     context: PageContext, name: str, run: str, shown: ShownPeriod, found: PeriodStars
 ) -> Iterator[Panel]:
-    """Panel with the tracks in a period of a spacecraft, if it has few enough batches."""
+    """Panel on the tracks in a period of a spacecraft; without tracks if it has many batches."""
     tracks = None
     if found.total <= MOST_LINKED:
         tracks = context.app.part(Tracks).of_period(name, run=run, start=shown.start, end=shown.end)
@@ -30,7 +30,7 @@ def tracks_of_period(
 
 
 def tracks_of_batch(context: PageContext, id: str, answer: Answer) -> Iterator[Panel]:
-    """Panel with the tracks through the unmatched stars of a result, if its attitude is known."""
+    """Panel with the tracks through the unmatched stars of a result, if there are any."""
     if answer.attitude is None or not answer.counts.unmatched:
         return
     tracks = context.app.part(Tracks).through_batch(id, answer.spacecraft, answer.run)

@@ -31,7 +31,7 @@ class Tracks:
         self._context = context
 
     def close(self) -> None:
-        """Do nothing: no file and no connection is open."""
+        """Do nothing on closing: no file and no connection is open."""
 
     def of_period(
         self,

@@ -13,7 +13,7 @@ from service.times import recorded_utc, utc_now
 
 
 def reads(app: App) -> Mapping[str, Callable[[], Any]]:
-    """Database query for webhooks, read before metrics are collected."""
+    """Function that reads the webhooks from the database for the metrics, by its name."""
     return {"webhooks": app.part(Webhooks).all}
 
 

@@ -39,7 +39,7 @@ def webhooks_page(query: FromQuery[PageQuery], context: ContextDep) -> Response:
 
 
 def notices(context: PageContext) -> Iterator[Notice]:
-    """Line of the overview about failing webhooks, for callers who may see their page."""
+    """Line of the overview about webhooks that fail, for callers who may see their page."""
     if context.caller.spacecraft is not None or not context.may_operate:
         return
     found = []

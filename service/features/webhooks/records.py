@@ -542,7 +542,7 @@ def read_sender(connection: Connection) -> tuple[str | None, int]:
 
 
 def hold_sender(connection: Connection, holder: str | None, beat: int) -> bool:
-    """Claim or keep the role of the delivering process; False if its number is not `beat`.
+    """Claim, keep or release the role of the delivering process; False if the beat differs.
 
     With None as holder the role is released.
     """

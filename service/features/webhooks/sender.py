@@ -61,7 +61,7 @@ T = TypeVar("T")
 
 
 def retry_delay_s(attempts: int, share: float) -> float:
-    """Delay in seconds after failed attempts: 5 s, doubled each time, at most an hour.
+    """Delay in seconds after failed attempts: 5 s, doubled up to an hour, and a random part.
 
     `share` is a random number from 0 to 1, for an additional delay of up to a fifth.
     """
@@ -366,7 +366,7 @@ class WebhookSender:
             return last_event(connection), webhooks.count_waiting(connection)
 
     def _after(self, position: int) -> tuple[Sequence[Event], int]:
-        """Next events after a position, and the number of deleted ones; none if it is unknown."""
+        """Next stored events after a position, and the number of deleted ones before them."""
         with self._store.reading_record() as connection:
             found = events_after(connection, position, READ_AT_ONCE)
             if found is not None:

@@ -108,7 +108,7 @@ def delete_annotation(
 
 
 def _require(caller: Caller, spacecraft: str | None) -> None:
-    """Raise `Forbidden` if a caller bound to spacecraft writes about others."""
+    """Raise `Forbidden` if a caller bound to spacecraft writes about others, or about all."""
     if spacecraft is None:
         require_all_spacecraft(caller)
     else:

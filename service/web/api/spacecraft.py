@@ -156,7 +156,7 @@ def get_overview(query: FromQuery[params.RunQuery], app: AppDep, caller: CallerD
     Returns("The version of the service and its data.", About),
 )
 def get_about(app: AppDep, caller: CallerDep) -> Response:
-    """Version, catalog, missions, database and credits."""
+    """The service's version, start, catalog, database and credits, and the caller's missions."""
     return json_response(app.service.about(caller.spacecraft))
 
 

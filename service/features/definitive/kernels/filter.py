@@ -148,7 +148,7 @@ def _measured(
     kind: npt.NDArray[np.int64],
     row: npt.NDArray[np.int64],
 ) -> tuple[Measured, npt.NDArray[np.int64]]:
-    """Measurements as arrays for the compiled kernels, and their times."""
+    """Convert measurements in a given order to arrays for the kernels, and list their times."""
     m = len(kind)
     found = Measured(
         kind, np.zeros((m, 4)), np.zeros((m, 3, 3)), np.zeros((m, 3)), np.zeros((m, 3))
