@@ -165,7 +165,7 @@ def mark_built() -> None:
 
 
 def _is_complete() -> bool:
-    """True if the cache holds every kernel undamaged; damaged files are removed."""
+    """True if numba's cache holds every compiled kernel undamaged; damaged files are removed."""
     marker = _marker()
     try:
         expected = int(marker.read_text(encoding="ascii"))

@@ -35,7 +35,7 @@ def attitude_of(
     sun_distance_au: float,
     method: str,
 ) -> AttitudeSolution | NoAttitude:
-    """The attitude solution of n identified stars, in one compiled call.
+    """The attitude solution of n identified stars, or the reason for none, in one compiled call.
 
     It is `solve_attitude` of the `matched_vectors`. `tracker_of` (n,) may be None for a single
     tracker. The solution's residuals have one row per observed star, NaN for stars without an
@@ -103,7 +103,7 @@ class FitColumns(NamedTuple):
     def of_batch(
         self, row: int, first: int, last: int, method: str
     ) -> AttitudeSolution | NoAttitude:
-        """The attitude solution of a batch, whose stars are rows from `first` to before `last`."""
+        """The attitude solution of one batch, or the reason for none, from the columns of many."""
         matched = int(self.matched[row])
         if matched < 0:
             return NoAttitude.DEGENERATE_GEOMETRY
@@ -208,7 +208,7 @@ def matched_vectors(
 def _matched_vectors(  # type: ignore[no-untyped-def]
     direction_body, sigma_rad, star, catalog_direction, velocity, sun_distance_au
 ):
-    """`matched_vectors`, compiled."""
+    """Compiled arrays of the vectors and sigmas of identified stars; see `matched_vectors`."""
     count = 0
     for k in range(len(star)):
         if star[k] >= 0:
@@ -234,7 +234,7 @@ def match(
     reference: Vector,
     sigma: Vector,
 ) -> int:
-    """Fill long enough arrays with the result of `matched_vectors`; returns the number of stars."""
+    """Fill arrays with the vectors and sigmas of identified stars; returns their number."""
     at_rest = velocity[0] == 0.0 and velocity[1] == 0.0 and velocity[2] == 0.0
     at = 0
     for k in range(len(star)):
@@ -253,7 +253,7 @@ def match(
 
 @njit_no_refcount
 def aberrate(natural, velocity, sun_distance_au, apparent):  # type: ignore[no-untyped-def]
-    """The apparent direction of a star for a moving observer, by the formula of ERFA's `ab`.
+    """Write the apparent direction of a star for a moving observer, by the formula of ERFA's `ab`.
 
     ERFA's own function is used wherever the overhead of a numpy call is acceptable.
     """

@@ -17,16 +17,16 @@ NODES_PER_UNIT = 14
 
 
 class WorkBudget:
-    """The remaining units of work for a batch, or for a part of the batch."""
+    """A counter of the units of work left for a batch, or for a part of it."""
 
     def __init__(self, units: int = MAX_WORK, whole: "WorkBudget | None" = None) -> None:
         self.left = units
         self.was_hit = False
-        """True once any part of the budget was exhausted."""
+        """True once the budget, or any part of it, was used up."""
         self._whole = whole
 
     def share(self, part: int, of: int) -> "WorkBudget":
-        """Sub-budget with a share of the remaining units; its spending also counts in the whole."""
+        """A budget with a share of the units left; what it spends also counts in the whole."""
         return WorkBudget(self.left * part // of, self)
 
     def spend(self, units: int) -> None:

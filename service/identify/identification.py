@@ -76,7 +76,7 @@ def not_known(n: int) -> Vector:
 
 
 def nothing_known(n: int) -> Identification:
-    """The identification of n stars that could not be searched for: all unmatched."""
+    """The identification of n stars that were not searched for: all unmatched."""
     return Identification(
         outcome=np.full(n, int(Outcome.UNMATCHED)),
         star=np.full(n, -1),
@@ -111,7 +111,7 @@ class IdentifiedColumns(NamedTuple):
     explained: Any
 
     def of_sighting(self, s: int, first: int, last: int, weighs: bool) -> Identification:
-        """The identification of one sighting, whose stars are rows from `first` to before `last`.
+        """The identification of one sighting, from the columns of many.
 
         `weighs` is true for an identifier by hypotheses, false for one by votes.
         """

@@ -23,8 +23,7 @@ from service.imaging.centroids.window import Array
 
 @dataclass(frozen=True)
 class PointImage:
-    """The image of a point source by direction: `intensity` (rows along q, columns along p) of odd
-    size, centred.
+    """The image of a point source as `intensity` by direction, centred, of odd size.
 
     The sum of intensity times `step_rad`² is the light in the image, in m² of open aperture.
     """

@@ -42,7 +42,7 @@ _WORDS = {"left_out": "not in the batch", "sharp": "hot pixel or cosmic ray"}
 
 @dataclass(frozen=True)
 class Mark:
-    """A marked place on a frame, in pixels: a star with its outcome, or a hot pixel or cosmic ray.
+    """A mark on a frame, in pixels: a star with its outcome, or a hot pixel or cosmic ray.
 
     `kind` is the star's outcome, `left_out` for a star in no batch, or `sharp` for a hot pixel or
     cosmic ray. `predicted_px` is the star's place by catalog and attitude, None if either is
@@ -172,7 +172,7 @@ def _draw_arrow(draw: "ImageDraw", x: float, y: float, along_x: float, along_y: 
 
 
 def _arrow_factor(marks: Sequence[Mark]) -> float:
-    """The enlargement of residual arrows, rounded to one digit so that it can be stated."""
+    """The scale factor of residual arrows, rounded to one digit; 0 without a predicted place."""
     lengths = [
         math.hypot(mark.predicted_px[0] - mark.u_px, mark.predicted_px[1] - mark.v_px)
         for mark in marks

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 LEAST_SIGMA_ARCSEC = 1e-3
 RANKS, LEAST_RANKS = (3, 21), 4
-"""Range of brightness ranks compared with the average sky, and the least number compared."""
+"""Range of the brightness ranks that are compared with the average sky, and their least number."""
 MOST_OFF_MAG = 3.0
 """Largest plausible difference of magnitudes from the average sky: star fields differ by a factor
 of five in number, 1.5 mag, and cameras in colour.
@@ -66,7 +66,7 @@ class FrameIn(schema.Wire):
     exposure_s: Annotated[schema.Number, Field(gt=0, le=3600)] | None = None
     centroid: CentroidMethod | None = None
     image: Annotated[str, Field(min_length=1, max_length=80)] | None = None
-    """The chosen image in a file with several; see `FrameLimits`."""
+    """The chosen image in a frame's file with several; see `FrameLimits`."""
     options: schema.OptionsIn = schema.OptionsIn()
 
     def batch_of(self, digest: str) -> str:
@@ -79,7 +79,7 @@ class FrameIn(schema.Wire):
         return f"frame-{name[:16]}"
 
     def fingerprint(self, spacecraft: str, digest: str) -> str:
-        """A digest of the frame and all of its metadata."""
+        """A digest of a spacecraft's frame and all of its metadata."""
         text = f"{spacecraft}\n{digest}\n{self.model_dump_json(exclude_defaults=True)}"
         return hashlib.sha256(text.encode()).hexdigest()
 
@@ -93,7 +93,7 @@ def read_known(values: dict[str, Any]) -> FrameIn:
 def submission_of_frame(
     file: IO[bytes], digest: str, known: FrameIn, mission: Mission, max_pixels: int
 ) -> schema.Submission:
-    """An observation batch of the stars on a frame, with a record of their detection.
+    """The submission of a frame: a batch of its stars, with a record of their detection.
 
     Raises `BadFile` for a file that is no frame of the tracker and for a frame without a star,
     `BadInput` for metadata that do not fit the mission.
@@ -153,7 +153,7 @@ def submission_of_frame(
 
 
 def time_of(known: FrameIn, frame: Frame) -> tuple[str, list[str]]:
-    """The time of a frame, and remarks on it.
+    """The time of a frame in UTC, and remarks on it.
 
     Without a time, aberration cannot be corrected. If aberration is ignored anyway, the time of
     arrival is recorded; otherwise raises `BadBatch`.
@@ -187,7 +187,7 @@ def exposure_stated(frame: Frame) -> str:
 def doubt_of_exposure(
     found: "Detections", camera: Camera, exposure_s: float | None, stated: str
 ) -> list[str]:
-    """A remark on a stated exposure at which the candidates' magnitudes are implausible for stars.
+    """Remarks, none or one, on a stated exposure by which the stars' magnitudes are implausible.
 
     The candidates' magnitudes, without the two brightest, are compared with the average magnitudes
     of as many stars in a field of this size.
@@ -301,7 +301,7 @@ def _record(
 
 
 def _star_fields(star: "MeasuredStar") -> dict[str, Any]:
-    """The fields of a measured candidate, rounded for JSON."""
+    """The fields of a measured star candidate in a frame's record, rounded for JSON."""
     record = star.record
     return {
         "u_px": _rounded(record.u_px, 4),
@@ -356,7 +356,7 @@ def preview_png(light: CountArray, noise_counts: float) -> tuple[bytes, int]:
 
 
 def _greys(sigmas: npt.NDArray[np.floating]) -> npt.NDArray[np.uint8]:
-    """Grey levels of light in sigmas of the noise, by the inverse hyperbolic sine."""
+    """Grey levels (0 to 255) of light in sigmas of noise, by the inverse hyperbolic sine."""
     above = np.clip(sigmas - BLACK_SIGMAS, 0.0, WHITE_SIGMAS)
     share = np.arcsinh(above / 4.0) / np.arcsinh(WHITE_SIGMAS / 4.0)
     return np.asarray(np.round(share * GREYS) * (255.0 / GREYS), dtype=np.uint8)

@@ -273,7 +273,7 @@ class CsvTable:
 def _order(
     keys: npt.NDArray[np.int64], times_ns: npt.NDArray[np.int64], ordered_by_time: bool
 ) -> npt.NDArray[np.int64]:
-    """The row order: by the earliest time of a row's batch, then batch, then place in the file."""
+    """Indices that sort rows by their batch's earliest time, batch, own time if asked, place."""
     _, first, batch = np.unique(keys, return_index=True, return_inverse=True)
     earliest = np.full(len(first), np.iinfo(np.int64).max)
     np.minimum.at(earliest, batch, times_ns)

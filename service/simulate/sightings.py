@@ -195,7 +195,7 @@ class BatchScene:
         return np.asarray(self.sky.magnitude_mag[row] <= tracker.limit_mag)
 
     def measured(self, seen: Seen, as_angles: bool) -> list[dict[str, Any]]:
-        """Star measurements with noise in the form sent to the service, as the tracker scans."""
+        """Noisy star measurements as sent to the service: vectors, angles or readings of a scan."""
         kind, size = self.stretch.kind, self.stretch.size
         own_arcsec = seen.tracker.sigma_arcsec if self.noise_arcsec is None else self.noise_arcsec
         sigma_arcsec = size if kind == "position_error" else own_arcsec

@@ -15,7 +15,7 @@ from typing import Generic, Protocol, TypeVar
 from service.errors import BeingBuilt
 
 BUILDS_AT_ONCE = 2
-"""Largest number of concurrent builds; each may take many times the memory of its result."""
+"""Largest number of cached objects built at a time; a build may take many times its result."""
 
 
 class Sized(Protocol):

@@ -26,7 +26,7 @@ from service.vectors import Vector
 SHOWN = GyroBlockRow.__struct_fields__
 SPAN_NS = int(gyro.MAX_SPAN_S) * 10**9
 TIMES = [gyro_blocks.c[name] for name in ("start_ns", "samples", "step_s", "times_s")]
-"""Columns of a gyro block that give the times of its samples."""
+"""Columns of a gyro block's row from which the times of its samples are computed."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Recorded:
 
 @dataclass(frozen=True)
 class BlockFilter:
-    """Selects the blocks of a spacecraft and a run that have a time from `start` to before `end`.
+    """Filter that selects the gyro blocks of a spacecraft and a run with a time in a period.
 
     A block counts from its first sample to its last.
     """

@@ -40,7 +40,7 @@ class Progress:
     ) -> None:
         self._database, self._writer = readers, writer
         self.is_shared = readers.file is None
-        """True for a database in which other processes record and project as well."""
+        """True for a database that other processes may write and project as well."""
         self._changed = threading.Condition()
         self._is_followed = False
         """True while this process has a projector that readers wait for."""
@@ -48,7 +48,7 @@ class Progress:
         """False while another process is known to project."""
         self._position = 0
         self._projected = -1
-        """Count of the writer's transactions at the last time when all were projected."""
+        """Number of the writer's commits when everything was last found projected."""
         self._readers = 0
         self._up_to_date_s = time.monotonic()
 
@@ -76,7 +76,7 @@ class Progress:
             self._changed.notify_all()
 
     def wait_for_reader(self, seconds: float) -> None:
-        """Wait until a reader waits for the projector, at most `seconds`."""
+        """Wait, at most `seconds`, until a reader waits for the projector or no reader can wait."""
         with self._changed:
             self._changed.wait_for(lambda: self._readers or not self._is_followed, seconds)
 
@@ -96,7 +96,7 @@ class Progress:
     # ---- for readers -------------------------------------------------------------------------
 
     def wait(self) -> float:
-        """Wait until everything recorded so far is projected, at most `WAIT_S`.
+        """Wait, at most `WAIT_S`, until everything recorded so far is projected.
 
         Returns the lag of the projections in seconds: zero if there is none, or if this process has
         no projector.
@@ -154,7 +154,7 @@ class Progress:
         return Lag(behind, time.monotonic() - self._up_to_date_s if behind else 0.0)
 
     def _count_behind(self, most: int) -> int:
-        """Number of results to be projected; counted exactly only where it may exceed `most`."""
+        """Number of results not projected yet; counted exactly only where it may exceed `most`."""
         if not self.is_shared and not self.is_behind():
             return 0
         newest, position = self.places()

@@ -81,7 +81,7 @@ class Readers:
 
 @contextmanager
 def _unavailable_is_busy() -> Iterator[None]:
-    """Convert a passing fault of the database into `Busy`."""
+    """Context manager that turns a passing fault of the database into `Busy`."""
     try:
         yield
     except TimeoutError as error:

@@ -30,7 +30,7 @@ class Store(Readers):
         archive_folder: Path | None = None,
         features_off: str = "",
     ) -> None:
-        """Open a database: SQLite is created and migrated, PostgreSQL must be up to date.
+        """Open a database: a writable SQLite file is created and migrated, others must be current.
 
         Without `create` SQLite's file must exist.  Batches that left the database are read from the
         `archive_folder`.
@@ -71,10 +71,10 @@ class Store(Readers):
             raise
         super().__init__(database, serving=serving, file=file)
         self.lock = ProjectorLock() if serving and file is None else None
-        """Lock of the projector on PostgreSQL: nothing is projected before it is taken."""
+        """Projector's lock on PostgreSQL, without which nothing is projected; None on SQLite."""
         wait_s = engines.LONGEST_WAIT_S if serving else None
         self.at_work = set[str]() if self.lock is None else self.lock.at_work
-        """Ids of the replays and calibrations in progress in this process."""
+        """Ids of the replays and calibrations that run in this process."""
         self.writer = Writer(
             self._writing, file=file, wait_s=wait_s, lock=self.lock, file_lock=self.file_lock
         )
@@ -93,7 +93,7 @@ class Store(Readers):
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
-        """Provide a connection whose snapshot has the projections of everything recorded so far.
+        """Context manager of a connection that sees the projections of everything recorded so far.
 
         The wait is at most a second: see `Progress.wait`.  A remaining lag is noted for the answer
         of the request.
@@ -119,7 +119,7 @@ class Store(Readers):
             yield connection, True
 
     def require_writing(self) -> None:
-        """Take the lock of a SQLite file; raises `BadConfiguration` if another process has it."""
+        """Take the lock of a SQLite file for writing; raises `BadConfiguration` if that fails."""
         if self.file_lock is not None:
             self.file_lock.take()
 

@@ -36,9 +36,7 @@ _NEAR_AXIS = 1e-3
 
 
 def distance_of(projection: Projection, angle_rad: float) -> float:
-    """The distance from the optical axis, in focal lengths, of a point at an angle from the
-    axis.
-    """
+    """The distance from the optical axis, in focal lengths, of a point at an angle to the axis."""
     return {
         "gnomonic": math.tan(angle_rad),
         "equidistant": angle_rad,
@@ -59,8 +57,7 @@ def _angle_of(projection: Projection, distance: Vector) -> Vector:
 
 
 def _stretch_of(projection: Projection, body: Vector) -> tuple[Vector, Vector]:
-    """The ratio of image distance to the sine of the angle for directions (n, 3), and its slope by
-    z.
+    """The ratio of image distance to the sine of the angle to the axis (n,), and its slope by z.
 
     It applies to a fisheye; both are infinite opposite to the optical axis.
     """
@@ -97,7 +94,7 @@ class Lens:
 
     @property
     def radius_px(self) -> float:
-        """Half the diagonal of the picture, in pixels."""
+        """Half the diagonal of the lens's picture, in pixels."""
         return 0.5 * math.hypot(self.width_px, self.height_px)
 
     @property
@@ -227,7 +224,7 @@ def lens_of(lens: Lens, names: tuple[str, ...], free: Vector) -> Lens:
 
 
 def _residual(lens: Lens, attitude: Matrix, u_px: Vector, v_px: Vector, star: Vector) -> Vector:
-    """Observed minus predicted coordinates (2 n,), in pixels of the undistorted projection."""
+    """Observed minus predicted places (2 n,) of stars, in pixels of the undistorted projection."""
     predicted = lens.projected(star @ attitude.T)
     return np.asarray(((lens.plane(u_px, v_px) - predicted) * lens.focal_px).ravel())
 
@@ -241,7 +238,7 @@ def linearised(
     v_px: Vector,
     star: Vector,
 ) -> tuple[Vector, Matrix]:
-    """The residuals (2 n,) in pixels, and their decrease per unit of each parameter (2 n, p).
+    """The residuals (2 n,) of stars in pixels, and their decrease per unit of parameter (2 n, p).
 
     Parameters are a small rotation about the camera's axes, then those of `lens_of`.
     """

@@ -30,9 +30,9 @@ Sets = npt.NDArray[np.int64]
 
 ACCEPT_LOG_ODDS = 14.0
 SURE_LOG_ODDS = 30.0
-"""Log odds of a solution at which the search ends at once."""
+"""Log odds of an attitude and lens at which a blind search ends at once."""
 STAGES = ((8, 0.02), (12, 0.02), (16, 0.025), (10, 0.05), (22, 0.025))
-"""Stages of the search: the number of likely points for patterns, and the tolerance of codes."""
+"""Stages of a blind search: number of likely points for patterns, and tolerance of their codes."""
 NARROW_TAN = 0.25
 """Largest ratio of half diagonal to focal length for which one trial focal length suffices."""
 WIDE_STEP = 1.3
@@ -57,23 +57,23 @@ class FocalRange:
 
     @property
     def log_width(self) -> float:
-        """The width of the range in logarithms, with a lower bound."""
+        """The width of a range of focal lengths in logarithms, at least 0.01."""
         return max(math.log(self.most_px / self.least_px), 0.01)
 
     @classmethod
     def about(cls, focal_px: float, share: float) -> "FocalRange":
-        """The range within a relative error of a focal length."""
+        """The range of focal lengths within a relative error of one."""
         return cls(focal_px / (1.0 + share), focal_px * (1.0 + share))
 
     @classmethod
     def of_fields(cls, side_px: int, field_deg: tuple[float, float]) -> "FocalRange":
-        """The range of focal lengths for a range of fields of view along a side."""
+        """The range of focal lengths at which a picture's side spans a range of fields of view."""
         least, most = (focal_px_of(side_px, deg) for deg in field_deg[::-1])
         return cls(least, most)
 
 
 def focal_px_of(side_px: int, field_deg: float, projection: Projection = "gnomonic") -> float:
-    """The focal length in pixels at which a side spans a field of view."""
+    """The focal length in pixels at which a picture's side spans a field of view."""
     return 0.5 * side_px / distance_of(projection, math.radians(0.5 * field_deg))
 
 
@@ -115,13 +115,13 @@ class BlindSolver:
         return 10 * self.direction.nbytes + 90_000_000
 
     def level(self, radius_deg: float) -> QuadLevel:
-        """The star patterns of one angular size."""
+        """The star patterns of one angular size, built at the first call."""
         if radius_deg not in self._levels:
             self._levels[radius_deg] = build_quad_level(self.direction, radius_deg)
         return self._levels[radius_deg]
 
     def solve(self, points: Points, focal: FocalRange, trials: int = 1) -> BlindResult:
-        """The attitude and lens with the most evidence for a picture's points.
+        """The attitude and lens with the most evidence for a picture's points, if it suffices.
 
         If it is one of several `trials` to explain one picture, it needs as many times the odds of
         a single trial.
@@ -145,7 +145,7 @@ class BlindSolver:
         )
 
     def refined(self, found: Verified, points: Points, focal: FocalRange) -> Verified:
-        """A verified solution refitted to more points, where that keeps most of the matches."""
+        """A verified solution refitted to more points; the same one if that loses many matches."""
         gate_px = max(5.0 * found.rms_px, 2.0)
         again = refine(points, self.stars, found, focal.log_width, gate_px)
         return again if again is not None and again.matched >= 0.9 * found.matched else found
@@ -153,7 +153,7 @@ class BlindSolver:
 
 @dataclass
 class _Search:
-    """The state of one blind search, with counts of the work done."""
+    """The state of one blind search of a picture, with counts of the work done."""
 
     solver: BlindSolver
     points: Points
@@ -210,7 +210,7 @@ class _Search:
                     yield rotation_between(body, sky[level.stars[row]]), at
 
     def verified_at(self, attitude: Matrix, lens: Lens) -> Verified | None:
-        """The verified solution of a hit; None where too few other stars match."""
+        """The verified solution of a pattern hit; None if too few other stars match."""
         few, stars = self.few, self.solver.stars
         gate_px = COARSE_GATE * lens.radius_px
         _, u, v = stars.near(attitude, lens, 2 * len(few))
@@ -226,7 +226,7 @@ class _Search:
 
 
 def _guesses(points: Points, focal: FocalRange) -> list[tuple[Lens, float, float]]:
-    """Trial lenses, each with the range of focal lengths that it represents."""
+    """Trial lenses, each with the least and largest focal length that it represents."""
     radius = 0.5 * math.hypot(points.width_px, points.height_px)
     narrow_px = radius / NARROW_TAN
     guesses = []

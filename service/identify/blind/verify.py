@@ -26,17 +26,17 @@ GATE_SIGMAS = 3.5
 LEAST_SIGMA_PX = 0.15
 """Least position sigma in pixels, before residuals show the actual errors."""
 FAINTEST_SHARE = 2.5
-"""Number of catalog stars tried per point: clutter and gaps shift the limiting magnitude."""
+"""Number of catalog stars tried per point of a picture, as clutter and gaps shift the limit."""
 LEAST_STARS, MOST_STARS = 12, 400
 MODELS = (FREE_SCALE, SCALE_BEND, SCALE_CENTER)
 FIRST_MODEL = 3
-"""Round from which lens models are fitted; earlier rounds collect matches."""
+"""Round of verification from which lens models are fitted; earlier ones collect matches."""
 LEAST_MATCHES = {FREE_SCALE: 4, SCALE_BEND: 7, SCALE_CENTER: 12}
 """Least number of matches for each lens model; among those allowed the evidence decides."""
 HOPELESS_LOG_ODDS = 0.0
 """Log odds after two rounds below which a hypothesis is dropped; chance stays below -5."""
 CROWD = 6
-"""Number of nearest points that measure the crowding of a place."""
+"""Least number of matches for each lens model in a refinement at a known attitude."""
 LEAST_REFINED = {FREE_SCALE: 4, SCALE_BEND: 6, SCALE_CENTER: 8}
 """Least number of matches for each lens model once the attitude is known."""
 
@@ -74,7 +74,7 @@ class Points:
         return np.asarray(np.maximum((near - 1) / others / share, 1.0))
 
     def first(self, count: int) -> "Points":
-        """The first `count` points, which are the most likely stars."""
+        """The first `count` points of a picture, which are the most likely stars."""
         return replace(
             self,
             u_px=self.u_px[:count],
@@ -85,13 +85,13 @@ class Points:
 
 @dataclass(eq=False)
 class Stars:
-    """The catalog stars (n, 3), brightest first, with search trees of their directions."""
+    """The catalog's directions (n, 3), brightest star first, with search trees."""
 
     direction: Vector
     _trees: dict[int, cKDTree] = field(default_factory=dict)
 
     def _brightest(self, toward: Vector, reach: float, most: int) -> Rows:
-        """The rows of the brightest `most` stars within an angle of a direction.
+        """The catalog rows of the brightest `most` stars within an angle of a direction.
 
         The search uses as many of the sky's brightest stars as have that number there on average,
         and more if that part of the sky is empty.
@@ -107,7 +107,7 @@ class Stars:
             count = 2.0 ** (power + 1)
 
     def near(self, attitude: Matrix, lens: Lens, most: int) -> tuple[Rows, Vector, Vector]:
-        """Brightest `most` stars on a picture: catalog rows, and their pixel coordinates (n)."""
+        """Catalog rows of the brightest `most` stars on a picture, and their pixel coordinates."""
         reach = lens.reach_rad + 0.002
         # Preselection before projection: the picture fills most of the cap about it.
         rows = self._brightest(attitude[2], reach, 3 * most)
@@ -207,7 +207,7 @@ def _refit(
     sigma: Vector,
     parameters: int,
 ) -> LensFit:
-    """The fit of a lens model to matches; without a model, with distortion if the matches allow."""
+    """Fit a lens to matches; for `parameters` 0, with distortion if there are enough matches."""
     if not parameters:
         parameters = SCALE_BEND if len(seen) >= LEAST_MATCHES[SCALE_BEND] else FREE_SCALE
     start = replace(lens, off_u=0.0, off_v=0.0, bend=lens.bend if parameters > FREE_SCALE else 0.0)
@@ -224,7 +224,7 @@ def _refit(
 
 
 def _scale(fit: LensFit, sigma: Vector) -> float:
-    """Factor, at least 1, by which sigmas must grow to agree with a fit's median residual."""
+    """Factor, at least 1, by which sigmas must grow to agree with a lens fit's median residual."""
     pull = np.abs(fit.residual_px) / sigma[:, None]
     # With few stars the fit absorbs a part of the residuals.
     freedom = max(pull.size - fit.parameters, 1) / pull.size
@@ -240,7 +240,7 @@ def _weights(
     seen: Rows,
     sigma: Vector,
 ) -> Vector:
-    """Cauchy weights about the median residual, so that wrong matches have little influence."""
+    """Weights (n,) of matches by their residuals, so that wrong ones have little influence."""
     u, v = lens.places(stars.direction[rows] @ attitude.T)
     off = np.hypot(points.u_px[seen] - u, points.v_px[seen] - v)
     usual = max(2.0 * float(np.median(off)), float(np.median(sigma[seen])))
@@ -250,7 +250,7 @@ def _weights(
 def _matches(
     points: Points, stars: Stars, attitude: Matrix, lens: Lens, gate_px: float
 ) -> tuple[Rows, Rows, Rows]:
-    """Catalog rows on the picture, and for every match the index of its row and of its point."""
+    """Catalog rows on the picture, and for each match the index into the rows and of its point."""
     most = int(np.clip(FAINTEST_SHARE * len(points), LEAST_STARS, MOST_STARS))
     rows, u, v = stars.near(attitude, lens, most)
     if len(rows) == 0:

@@ -26,7 +26,7 @@ from service.identify.sighting import PRIOR_DIRECTION, PRIOR_ROTATION
 
 CLUTTER_SPAN_MAG = 6.0
 POSITION_SCALES = np.array([1.0, 2.0, 4.0, 8.0, 16.0])
-"""Factors on a tracker's sigma, averaged over: 2 to 34 arcsec for the shipped trackers."""
+"""Factors on a tracker's sigma over which hypotheses' evidence is averaged."""
 MAGNITUDE_SCALES_MAG = np.array([0.1, 0.2, 0.4, 0.8, 1.6, 3.2])
 OFFSET_SIGMA_MAG = 0.5
 """Prior sigma of a common offset of the observed magnitudes, if there is one."""
@@ -49,14 +49,14 @@ _LOG_POSITION_SCALES = np.log(POSITION_SCALES)
 _LOG_MAGNITUDE_SCALES = np.log(MAGNITUDE_SCALES_MAG)
 _FEW = 32
 _LOG_JOINT = np.log(MAGNITUDE_SCALES_MAG**2 + np.arange(_FEW + 1)[:, None] * OFFSET_SIGMA_MAG**2)
-"""Table of log(t^2 + count sigma^2) for up to `_FEW` stars."""
+"""Table of log(t^2 + count sigma^2) by count of stars and scale t, for magnitude evidence."""
 _LOG_BETA_OF_NONE = (
     math.lgamma(BETA_CLUTTER) + math.lgamma(BETA_STAR) - math.lgamma(BETA_CLUTTER + BETA_STAR)
 )
 
 
 def _table_of_clutter() -> npt.NDArray[np.float64]:
-    """A table of log probabilities for small numbers of clutter points and stars."""
+    """A table of log probabilities by number of clutter points and of stars, for small numbers."""
     table = np.empty((_FEW + 1, _FEW + 1))
     for clutter in range(_FEW + 1):
         for stars in range(_FEW + 1):
@@ -151,9 +151,7 @@ def log_positions(stars, square, log_det, reference_sigma_rad):  # type: ignore[
 
 
 _LOG_EXACT = np.array([log_positions.py_func(count, 0.0, 0.0, 1.0) for count in range(_FEW + 1)])
-"""Table of position evidence without residuals, by number of stars, for a sigma of one radian; for
-another sigma a multiple of its logarithm is added.
-"""
+"""Table of position evidence without residuals, by number of stars, for a sigma of one radian."""
 
 
 @njit_no_refcount

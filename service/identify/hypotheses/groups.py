@@ -42,7 +42,7 @@ were wrong: sometimes a star of one group also fits the attitude of the other.
 
 _UNMATCHED, _UNIQUE, _AMBIGUOUS = (int(outcome) for outcome in Outcome)
 _NO_ROWS, _NO_VOXELS = np.empty(0, np.int32), np.empty((0, 0), np.uint8)
-"""A grid without stars; a kernel takes arrays of its module as locked ones, as a zone's are."""
+"""Arrays without rows, in place of the zone's search grid, for weighing known identities."""
 
 
 def may_be_a_group(masks: Sequence[Mask]) -> bool:
@@ -53,7 +53,7 @@ def may_be_a_group(masks: Sequence[Mask]) -> bool:
 def part_of(
     corrected: Sequence[CorrectedObservations], masks: Sequence[Mask]
 ) -> tuple[CorrectedObservations, ...]:
-    """The observations restricted to the stars in each tracker's mask (n,)."""
+    """The observations of each tracker restricted to the stars in its mask (n,)."""
     return tuple(
         structs.replace(
             each,
@@ -68,7 +68,7 @@ def part_of(
 
 
 def of_all(part: Identification, mask: Mask) -> Identification:
-    """The identification of some of the stars, extended to all with the others unmatched."""
+    """The identification of some of a tracker's stars, extended to all, the others unmatched."""
     n = len(mask)
     places = np.flatnonzero(mask).tolist()
 
@@ -142,7 +142,7 @@ def shared(found: Identification, rival: Identification, share: float) -> Identi
 
 
 def first_share(log_weight: float, other_log_weight: float, stars: int) -> float:
-    """Probability share of the first of two groups by log weights; `stars` in the smaller group.
+    """Probability share of the first of two groups of stars, from both log weights.
 
     The noise of the groups' chi-squares does not show which one is real, so that part of the
     difference of weights is ignored.

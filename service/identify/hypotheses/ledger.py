@@ -46,7 +46,7 @@ def _same(match, ledger, h):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def _hash(match):  # type: ignore[no-untyped-def]
-    """A hash of a match that separates hypotheses differing in one star."""
+    """A hash of a match, by which hypotheses that differ in one star usually differ."""
     hashed = 0
     for row in match:
         hashed = (hashed ^ (row + 1)) * 73856093
@@ -55,7 +55,7 @@ def _hash(match):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def _enter(ledger, h):  # type: ignore[no-untyped-def]
-    """Enter hypothesis h into the ledger's hash table."""
+    """Enter hypothesis h of the ledger into its own hash table."""
     table = ledger.table
     at = _hash(ledger.match[h]) & (len(table) - 1)
     while table[at] >= 0:
@@ -114,14 +114,14 @@ def _smallest(values: Vector, at: int) -> float:
 
 @njit_no_refcount
 def clear(ledger):  # type: ignore[no-untyped-def]
-    """Reset the heaviest hypotheses of an earlier search; others are ignored by count."""
+    """Reset the heaviest hypotheses in a ledger; the count of the new search hides all others."""
     ledger.heaviest_match[:] = -1
     ledger.heaviest[0] = ledger.heaviest_dropped[0] = -math.inf
 
 
 @njit_inlined
 def spent(progress, work):  # type: ignore[no-untyped-def]
-    """The progress of a search after additional work."""
+    """The progress of a search with further work added."""
     return Progress(
         *(progress.count, progress.unexplored_weight, progress.best),
         *(progress.work + work, progress.max_work),
@@ -143,7 +143,7 @@ def left_unexplored(progress, log_weight):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def keep(match, value, ledger, progress):  # type: ignore[no-untyped-def]
-    """Add a weighed hypothesis to the ledger; returns the progress.
+    """Add a weighed hypothesis to the ledger; returns the new progress of the search.
 
     Where the ledger is full, the lightest quarter goes to the unexplored weight, and from then on
     so does any hypothesis that is no heavier.
@@ -214,7 +214,7 @@ class StarPosterior(NamedTuple):
 
 @njit(nogil=True)
 def marginals(ledger, count, unexplored_weight, posterior):  # type: ignore[no-untyped-def]
-    """Sum the first `count` hypotheses of a ledger into star probabilities, except `hypothesis`."""
+    """Sum the hypotheses of a ledger into probabilities of each star's identities (`posterior`)."""
     rivals, rival_probability = posterior.rivals, posterior.rival_probability
     log_weight = ledger.log_weight
     n, listed = rivals.shape

@@ -21,7 +21,7 @@ LARGEST_GATE_RAD = 0.009
 NEGLIGIBLE = 18.0
 """Log weight below the best at which a hypothesis is only summed, not kept."""
 NEAR_SIGMAS, NEAR_MAG, RARE = 3.0, 0.5, -6.0
-"""Sigmas, magnitude difference and rarity of chance neighbours for a star surely no clutter."""
+"""Limits for a star that is surely no clutter: sigmas, magnitude difference, log of chance."""
 
 
 @njit_no_refcount
@@ -123,7 +123,7 @@ def _sits_well(observed, stars, match, k, scratch):  # type: ignore[no-untyped-d
 
 @njit(nogil=True, inline="always")
 def _match_at(observed, stars, t, first, second):  # type: ignore[no-untyped-def]
-    """Match every observed star at an attitude: its nearest zone star, and the second-nearest."""
+    """Find each observed star's nearest and second-nearest zone star at an attitude; else -1."""
     direction, velocity = observed.direction, observed.velocity
     n = len(direction)
     first[:] = -1

@@ -65,7 +65,7 @@ def reflect(observed, boresight, image):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def in_a_mirror(observed, image):  # type: ignore[no-untyped-def]
-    """The observed stars with reflected directions."""
+    """The observed stars with the directions of their mirror image."""
     return ObservedStars(
         direction=image,
         magnitude=observed.magnitude,

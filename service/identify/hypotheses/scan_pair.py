@@ -31,11 +31,11 @@ MAX_THIRDS = 8
 AGREEING_TILT_RAD = math.radians(3.0)
 """Largest tilt of a presumed axis that still explains a pair's difference of angles to the axis."""
 INITIAL_SLACK = 12.0
-"""Log weight by which the first guess of the best hypothesis is below the bound for all stars."""
+"""Log weight subtracted from the bound for all stars as a first guess of the best hypothesis."""
 
 
 class Scan(NamedTuple):
-    """One pass over the catalog candidates of observed stars i and j.
+    """Parameters of one pass over the catalog pairs that may be observed stars i and j.
 
     `others` stars of other groups are predicted. A candidate weighs at least `log_penalty` less
     than the `weight_bound` of its stars. With a presumed axis (`by_axis`) a pass covers either the
@@ -109,7 +109,7 @@ def scan_pair(  # type: ignore[no-untyped-def]
 
 @njit_inlined
 def _score_candidates(observed, stars, pairs, scan, fewest, scratch, ledger, progress):  # type: ignore[no-untyped-def]
-    """Pass once over the candidates of a scan; returns the progress.
+    """Score the candidates of a scan in one pass; returns the search's progress.
 
     A candidate with fewer than `fewest` matches is counted in `scratch.deferred_counts` by its
     largest possible number of matches; `fewest` rises with the best weight.
@@ -170,7 +170,7 @@ def _score_candidates(observed, stars, pairs, scan, fewest, scratch, ledger, pro
 
 @njit_inlined
 def _evaluate(observed, stars, scan, a, b, fewest, scratch, ledger, progress):  # type: ignore[no-untyped-def]
-    """Match zone stars a and b with the observed pair, and consider the other stars predicted.
+    """Match zone stars a and b with the observed pair and other stars predicted; weigh the match.
 
     Returns the largest possible number of matches if it is below `fewest`, and the progress.
     """
@@ -261,7 +261,7 @@ def _half_log_det(observed, i, j, order, others):  # type: ignore[no-untyped-def
 
 @njit_inlined
 def _test(scratch, others, at):  # type: ignore[no-untyped-def]
-    """Prediction coefficients and voxel level of one of the other stars; level -1 if unusable."""
+    """Coefficients that predict an observed star from a pair, and its voxel level; -1 for none."""
     if at >= others:
         return 0.0, 0.0, 0.0, -1
     k = scratch.order[at]
@@ -286,7 +286,7 @@ def _missing(voxels, test, u0, u1, u2, v0, v1, v2, w0, w1, w2):  # type: ignore[
 
 @njit_inlined
 def _fewest(observed, stars, scan, best, bounds):  # type: ignore[no-untyped-def]
-    """The least number of matches with which a candidate of a scan matters beside the best."""
+    """The least number of matches for which a scan's candidate can matter beside the best."""
     fewest = 3
     while fewest <= scan.others + 2 and (
         weight_bound(fewest, observed, stars, bounds) - scan.log_penalty < best - NEGLIGIBLE
@@ -297,7 +297,7 @@ def _fewest(observed, stars, scan, best, bounds):  # type: ignore[no-untyped-def
 
 @njit_no_refcount
 def _predictors(observed, i, j, scratch):  # type: ignore[no-untyped-def]
-    """Express every star of other groups as alpha V_i + beta V_j + gamma V_i x V_j.
+    """Find how a pair predicts other groups' stars; returns their number and the pair's sin^2.
 
     A catalog pair (a, b) for (i, j) then predicts it at alpha a + beta b + gamma a x b, without an
     attitude. Returns the number of predicted stars, which are ordered by accuracy, and the squared

@@ -49,7 +49,7 @@ matches four of them, and it may be found first. And it stops only if too few st
 unexplained for a second attitude: see `leaves_a_group`.
 """
 LARGEST_LOG = 1e5
-"""A finite replacement for an infinite log weight."""
+"""A finite log weight that replaces an infinite one."""
 CONVERGED_LOG = 10.0
 """Log weight below the best at which all unseen hypotheses together end an exhaustive search."""
 

@@ -51,7 +51,7 @@ def identify_verified(
 
 @njit(nogil=True)
 def weigh_sightings(which, seen, zone, star_of, exhaustive, found):  # type: ignore[no-untyped-def]
-    """Weigh the hypotheses of the sightings that a zone serves, after their votes were counted.
+    """Weigh hypotheses for the sightings that a zone serves, and record their stars' identities.
 
     `which` are the sightings' rows in the columns `seen` and `found`.
     """
@@ -103,7 +103,7 @@ def _name(k, at, posterior, star_of, found):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def _weigh(sighted, zone, bounds, exhaustive, max_work, posterior):  # type: ignore[no-untyped-def]
-    """Search and sum hypotheses; returns if it was cut short, if mirrored, and the work."""
+    """Search and sum a sighting's hypotheses; returns if cut short, if mirrored, and the work."""
     n = len(sighted.direction)
     observed, stars, pairs = scene_in(sighted, zone, bounds)
     scratch, ledger = scratch_for(n), ledger_for(n)

@@ -21,7 +21,7 @@ FOUND, TOO_FEW, NOTHING, DOUBTFUL, DEGENERATE = 0, 1, 2, 3, 4
 
 @njit(nogil=True)
 def decide(ledger, count):  # type: ignore[no-untyped-def]
-    """The heaviest match of the ledger, the log odds of its attitude, and the decision code."""
+    """The index of the ledger's heaviest match, its attitude's log odds, and the decision code."""
     weights, attitudes, covariances = ledger.weight, ledger.attitude, ledger.covariance
     if count == 0:
         return -1, -math.inf, NOTHING
@@ -55,7 +55,7 @@ def decide(ledger, count):  # type: ignore[no-untyped-def]
 def star_probabilities(  # type: ignore[no-untyped-def]
     points, index, field, magnitude_gate, t, covariance, match, doubt
 ):
-    """Most likely star of each point, probabilities of it and of no star, and the second star.
+    """Most likely star of each point, the probabilities of it and of no star, and the second star.
 
     A point may be its match, the second star near its place, or clutter with the density of the
     unexplained points. `doubt` is the probability that the attitude is wrong, which reduces every

@@ -27,9 +27,9 @@ SIGMA_FLOOR_ARCSEC = 1.5
 """Least position sigma of a star in arcsec: an index serves a year and leaves parallax out."""
 AT_REST = np.zeros(3)
 COLOR_SIGMA_MAG = 0.3
-"""Magnitude error beside the noise, from colours and variable stars."""
+"""Sigma of a magnitude from colours and variable stars, beside the measurement noise."""
 FEW_MATCHES, LARGEST_SCATTER_MAG = 4, 1.0
-"""Up to this number of matches without magnitudes, largest scatter of magnitude offsets.
+"""Number of matches up to which the scatter of magnitude offsets is limited, and its limit.
 
 Otherwise chance gives three random points an attitude in 1 of 15,000 batches. The limit is twice
 the noise of a tracker with poor photometry: half of it would refuse real fields of four stars.
@@ -180,7 +180,7 @@ def _magnitude_offsets(result: LostInSpaceResult, magnitude_mag: Vector, index: 
 def _without_magnitudes(
     corrected: Sequence[CorrectedObservations],
 ) -> tuple[CorrectedObservations, ...]:
-    """Corrected observations of all trackers, no magnitudes; trackers may share their offset."""
+    """Corrected observations of all trackers without their magnitudes."""
     return tuple(
         # Read-only, as a batch's arrays are: for writable ones numba would compile every kernel
         # again.

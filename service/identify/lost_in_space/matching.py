@@ -19,7 +19,7 @@ ROUNDS = 5
 REJECT_LOG = -4.0
 """Log evidence of the points, before the last fit, below which a candidate is dropped."""
 EDGE = 0.985
-"""Share of the field's half widths within which a star is expected to be seen."""
+"""Share of a field's half widths within which a star is expected to be seen."""
 
 
 @njit(nogil=True, error_model="numpy", forceinline=True)
@@ -139,7 +139,7 @@ def gauss_newton_step(points, stars, candidate):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, error_model="numpy", forceinline=True)
 def match_at(points, index, magnitude_gate, candidate):  # type: ignore[no-untyped-def]
-    """Match every point at an attitude with covariance; returns the number, true if any changed."""
+    """Match every point at an attitude; returns the number matched, and true if a match changed."""
     faces, cell_place = index.face, index.cell_place
     cell_start, cell_rows = index.cell_start, index.cell_rows
     limit_mag = index.class_edge[-1, 0]
@@ -253,7 +253,7 @@ def points_alone(points, stars, field, match, matched, chi2, log_det):  # type: 
 
 @njit(nogil=True, error_model="numpy", forceinline=True)
 def stars_inside(place, patch_rows, at, end, reach, t, field, inside):  # type: ignore[no-untyped-def]
-    """Next stars of a patch inside the field, as many as fit in a buffer, and where to continue.
+    """Write the next stars of a patch inside a field to a buffer; returns their number and end.
 
     Written without branches on the data, so that memory accesses do not wait for each other.
     """

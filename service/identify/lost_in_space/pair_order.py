@@ -14,7 +14,7 @@ LEAST_PAIR_RAD = 0.006
 TYPICAL_REACH_RAD = 0.07
 """Typical distance of the other points of a field from a pair."""
 CHORD_OF_LONGEST = 0.999
-"""Ratio of the chord to the arc of 8 degrees, rounded down."""
+"""Error of a star's place from the cell size of a sky bitmap, in radians."""
 CELL_RAD = 2.5e-3
 """Error of a star's place from the cell size of a bitmap."""
 EXACT_COST = 2.0
@@ -22,13 +22,13 @@ EXACT_COST = 2.0
 PRIOR_COST = 40.0
 """Fixed cost of trying a pair, in units of one candidate."""
 RANK_COST = 0.15
-"""Increase of a pair's cost per rank: fainter points are less likely to be stars of the index."""
+"""Relative increase of a pair's cost per rank of its points, as fainter ones are less useful."""
 USE_COST = 3.0
-"""Factor on a point's cost after each failed try."""
+"""Factor on the cost of a point's other pairs after each try of a pair."""
 MOST_BEYOND = 0.9
 """Bound on the probability that a point is too faint; below 1: magnitudes may share an offset."""
 SURELY_WITHIN = 5.0
-"""Sigmas above the limit from which a point is surely no star beyond the limit."""
+"""Sigmas by which a point is brighter than the limit from which it is surely no star beyond it."""
 NO_ROW = 1 << 16
 """A row number larger than any in the index."""
 MAGNITUDE_GATE = 3.3
@@ -38,7 +38,7 @@ OFFSET_ALLOWED_MAG = 0.15
 
 @njit(nogil=True)
 def magnitude_gate(sigma_mag):  # type: ignore[no-untyped-def]
-    """The largest difference between the magnitudes of a point and its star."""
+    """The largest accepted difference between the magnitudes of a point and its star."""
     return MAGNITUDE_GATE * math.hypot(sigma_mag, OFFSET_ALLOWED_MAG)
 
 
@@ -59,7 +59,7 @@ def rows_of_magnitude(brighter, magnitude, gate):  # type: ignore[no-untyped-def
 
 @njit(nogil=True, error_model="numpy")
 def describe_points(points, index, sigma_mag, gate, pairs):  # type: ignore[no-untyped-def]
-    """Fill `pairs` with each point's range of pair classes, and its chance to be beyond the limit.
+    """Fill `pairs` with each point's pair classes, and its chance to be a star beyond the limit.
 
     Since faint stars are more numerous, noise makes more of them look bright than the reverse: the
     likely true magnitude is fainter than the measured one.
@@ -88,7 +88,7 @@ def chord(a, b):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, error_model="numpy")
 def buckets_of(points, index, i, j, gate):  # type: ignore[no-untyped-def]
-    """The range of separation buckets in the index for the stars of a pair of points."""
+    """The range (first, last) of the index's separation buckets that a pair of points may match."""
     apart = 2.0 * math.asin(min(1.0, 0.5 * chord(points.observed[i], points.observed[j])))
     variance = points.sigma[i] * points.sigma[i] + points.sigma[j] * points.sigma[j]
     tolerance = gate * math.sqrt(variance) + SLACK_RAD
@@ -101,7 +101,7 @@ def buckets_of(points, index, i, j, gate):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def classes_of(magnitude, class_edge, gate):  # type: ignore[no-untyped-def]
-    """The range of pair classes for a fainter star's magnitude; all if the magnitude is unknown."""
+    """The range (first, last) of pair classes for a fainter star's magnitude; all if unknown."""
     classes = len(class_edge)
     if np.isnan(magnitude):
         return 0, classes - 1

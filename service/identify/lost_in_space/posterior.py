@@ -28,7 +28,7 @@ LEAST_EVIDENCE = math.log(1.0 / DOUBT - 1.0) + LOG_NULL
 """Least log evidence of any reported attitude."""
 
 POSITION_SCALES = ((0.15, 0.5), (0.6, 1.0), (0.25, 2.0))
-"""Weights of the noise models, and their factors on the sigmas."""
+"""Noise models of positions: the weight of each, and its factor on the sigmas."""
 _LOG_SCALES = tuple((math.log(w), math.log(s), 0.5 / (s * s)) for w, s in POSITION_SCALES)
 CLEAN_CLUTTER = 0.3
 """Probability in a clean field that a further point is no star of the index."""
@@ -40,7 +40,7 @@ COUNT_SLOPE = 0.5 * math.log(10.0)
 """Growth of the number of stars per magnitude: the logarithm of 10^0.5."""
 
 MISSING_REACH, MISSING_STEPS = 2.0, 16
-"""Extent of the missing-star table in sigmas on either side of the limit; steps per sigma."""
+"""Reach of the missing-star table to either side of the limit in sigmas, and steps per sigma."""
 FAINT_REACH = 1.0
 """Sigmas by which a star is fainter than the limit from which the search leaves it out."""
 
@@ -54,7 +54,7 @@ LOG_MISSING = np.array(
 CROWDED = 2.3
 """Allowance in ln det N for matched points that lie closer together than all points."""
 ALWAYS_ENOUGH = 4
-"""Number of matched points from which a candidate is never ruled out beforehand."""
+"""Number of matched points from which a candidate attitude is never ruled out beforehand."""
 _LOG_2PI = math.log(2.0 * math.pi)
 _LOG_ROTATIONS = math.log(8.0 * math.pi**2)
 

@@ -18,12 +18,12 @@ RANK_WEIGHT = 0.04
 
 
 BEYOND, DEEP_COST = 0.02, 1.5
-"""Probability of lying beyond the limit from which a point is less useful; its cost factor."""
+"""Probability of a star beyond the limit from which a point counts as less useful; cost factor."""
 
 
 @njit(nogil=True, error_model="numpy")
 def predict(points, beyond, i, j, largest, prefilter):  # type: ignore[no-untyped-def]
-    """Compute all points' prediction coefficients and gates, and sort points by information.
+    """Compute how a pair of points predicts the others, and sort the others by information.
 
     The results go into `prefilter`. `beyond` (n,) is each point's probability to be a star beyond
     the limit. Returns the number of points with a gate of at most `largest`.

@@ -35,7 +35,7 @@ def ranked(prefilter, beyond, prefiltered):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, error_model="numpy")
 def pairs_of(pairs, place, at, count, rows_i, rows_j, chunk):  # type: ignore[no-untyped-def]
-    """Prepare the next `count` star pairs for the prefilter; returns the number of candidates.
+    """Load the next `count` star pairs into the prefilter; returns their number of candidates.
 
     Stars for point i are in the row range `rows_i` (first, one past the last), those for point j in
     `rows_j`. Written without branches, so that it is vectorised.
@@ -57,7 +57,7 @@ def pairs_of(pairs, place, at, count, rows_i, rows_j, chunk):  # type: ignore[no
 
 @njit(nogil=True)
 def possible_of(bits, count, asked, prefilter, chunk):  # type: ignore[no-untyped-def]
-    """The number of candidates in a chunk with a star near the predicted place of the first points.
+    """The number of a chunk's candidates whose first predicted points may have a star.
 
     Their numbers go to `chunk.possible`: twice the pair's index, plus one for the reversed order.
     """
@@ -88,7 +88,7 @@ def possible_of(bits, count, asked, prefilter, chunk):  # type: ignore[no-untype
 
 @njit(nogil=True)
 def stars_near(bits, prefilter, plan, place_a, place_b):  # type: ignore[no-untyped-def]
-    """A bit mask, by rank, of points that may have a star if points i and j are two given stars.
+    """Mask, by rank, of points that may have a star if i and j are two given stars; 0 if too few.
 
     Zero if too few of the points that are checked first may have a star.
     """

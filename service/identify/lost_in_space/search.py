@@ -40,7 +40,7 @@ from service.identify.lost_in_space.workspace import (
 from service.sky.whole_sky.index import BITMAP_RADII_RAD
 
 FIRST_POINTS = 7
-"""Number of brightest points whose pairs come first in rich fields; then `MOST_POINTS`."""
+"""Number of brightest points whose pairs are tried first in rich fields."""
 FIRST_TRIES = 3
 """Number of pairs tried by cost alone, before the sets of which every attitude contains a pair."""
 NARROW_GATE, NARROW_MAG = 2.8, 0.75
@@ -54,7 +54,7 @@ PREFILTERED_IN_TURN = 6
 Later tries rotate among all points, since the bright ones may all be false.
 """
 MAX_PREFILTERED = 12
-"""Largest number of further points that a candidate is compared with."""
+"""Largest number of further points that bitmaps and exact places test for a candidate."""
 REFINE_WORK = 60
 """Work of refining a candidate, in units of one candidate."""
 MAX_WORK = 600_000
@@ -170,7 +170,7 @@ def strong_of(further, prefiltered):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def plan_of(n, i, j, prefiltered, tries, may_be_narrow, further, gate_mag, prefilter):  # type: ignore[no-untyped-def]
-    """The plan for testing a pair's candidates; the ranks checked first go to `prefilter.turn`."""
+    """The plan for testing the star pairs that a pair of points may be."""
     prefiltered = min(prefiltered, MAX_PREFILTERED)
     narrow = prefiltered >= 2 and may_be_narrow
     # Other points at every try, since the most informative may be false; with few points all of
@@ -195,7 +195,7 @@ def plan_of(n, i, j, prefiltered, tries, may_be_narrow, further, gate_mag, prefi
 
 @njit(nogil=True, error_model="numpy", forceinline=True)
 def try_pair(points, index, field, gate_mag, plan, workspace):  # type: ignore[no-untyped-def]
-    """Test every star pair of the index for a pair of points; returns the state of the search."""
+    """Test every star pair of the index for a pair of points; returns if and why to end."""
     i, j = plan.i, plan.j
     prefilter, chunk, counters = (
         prefilter_in(workspace),
@@ -295,9 +295,7 @@ def hits_of(points, index, gate_mag, plan, a, b, near, workspace):  # type: igno
 
 @njit(nogil=True)
 def defer(workspace, i, j, a, b, near):  # type: ignore[no-untyped-def]
-    """Store a candidate for later: points i and j as stars a and b, and the mask of other
-    points.
-    """
+    """Store a weak candidate for later: stars a and b for points i and j, and a mask of others."""
     deferred, counters = deferred_in(workspace), counters_in(workspace)
     at = counters[DEFERRED]
     deferred[at, PAIR] = i * MOST_POINTS + j

@@ -32,7 +32,7 @@ from service.vectors import Matrix, Vector, locked
 Rows = npt.NDArray[np.int64]
 _AT_REST = np.zeros(3)
 _BLOCKS: list[Vector] = []
-"""Work blocks in reserve, as many as searches ever ran at once."""
+"""Work blocks kept for reuse, as many as searches ever ran at once."""
 FEWEST_POINTS = 3
 """Least number of points for a search: two stars are ambiguous."""
 
@@ -94,7 +94,7 @@ class LostInSpaceResult(NamedTuple):
 
     refusal: NoAttitude | None
     matrices: npt.NDArray[np.float64]
-    """The attitude and covariance matrices (2, 3, 3); see `attitude` and `covariance_rad2`."""
+    """The attitude matrix and the covariance matrix, stacked (2, 3, 3)."""
     star: Rows
     """The index row of each point's star (n,), -1 for an unexplained point."""
     log_odds: float
@@ -163,7 +163,7 @@ class LostInSpace:
         sigma_rad: Vector,
         velocity_c: Vector = _AT_REST,
     ) -> StarChances:
-        """The probabilities of every point's star at the attitude of a result."""
+        """The probabilities of each point's star, and of its rival, at the attitude of a result."""
         points = Points(*map(locked, (direction, magnitude_mag, sigma_rad, velocity_c)))
         doubt = 1.0 / (1.0 + math.exp(min(result.log_odds, 700.0)))
         gate = magnitude_gate(self.field.magnitude_sigma_mag)
@@ -199,7 +199,7 @@ def _sort_points(direction, magnitude, sigma, velocity, workspace):  # type: ign
 
 @njit(nogil=True)
 def _decided(n, count, work, bounded, workspace, matrices, star):  # type: ignore[no-untyped-def]
-    """The decision with rows in the given order of points; see `LostInSpaceResult`."""
+    """Fill attitude, covariance and stars in the given order of points; returns the decision."""
     ledger, order = ledger_in(workspace), order_in(workspace)
     best, log_odds, code = decision.decide(ledger, count)
     matched = 0

@@ -24,7 +24,7 @@ MAX_DEFERRED = 4096
 USUAL_POINTS = 64
 """Number of points for which a reusable block has room."""
 RANKS = 16
-"""Number of slots for the most informative points; `MAX_PREFILTERED` are used."""
+"""Number of ranks for which the most informative points have slots in the work arrays."""
 
 _SHARED = np.dtype(
     [
@@ -53,7 +53,7 @@ _SHARED = np.dtype(
     ],
     align=True,
 )
-"""Layout of the part of a block that is independent of the number of points."""
+"""Layout of the part of a work block whose size is independent of the number of points."""
 _OF_A_POINT = np.dtype(
     [
         ("observed", np.float64, 3),
@@ -73,7 +73,7 @@ _OF_A_POINT = np.dtype(
         ("ledger", np.int64, LEDGER),
     ]
 )
-"""Layout of the part of a block per point; it follows the fixed part, field by field."""
+"""Layout of the part of a work block that has one entry per point, field by field."""
 
 
 def _offsets(layout: np.dtype[Any]) -> Any:
@@ -142,7 +142,7 @@ class Candidate(NamedTuple):
 
 
 class PointPairs(NamedTuple):
-    """The data that determine which pair of points is tried next.
+    """Data that decide which pair of points a lost-in-space search tries next.
 
     The `cost` (24, 24) of every pair, the penalty of each point for being `used` (24,), and which
     are `covered` (24,). For every point (n,) the `first` and `last` class of pairs whose fainter
@@ -193,7 +193,7 @@ class Chunk(NamedTuple):
 
 
 class Workspace(NamedTuple):
-    """The memory of a search for n points: a block of `words_for(n)` words.
+    """The memory of a lost-in-space search for n points, as one block of words.
 
     Kernels pass it on whole and take views where needed: passing dozens of arrays takes minutes to
     compile.
@@ -211,7 +211,7 @@ def words_for(n):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def _by_point(workspace, offset, shape, dtype):  # type: ignore[no-untyped-def]
-    """A view of a per-point field in a workspace."""
+    """A view of an array with an entry per point in a workspace."""
     block, n = workspace
     return view_into(block, SHARED_BYTES + n * offset, shape, dtype)
 
@@ -230,13 +230,13 @@ def points_in(workspace):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def order_in(workspace):  # type: ignore[no-untyped-def]
-    """The original row numbers (n,) of the sorted points in a workspace."""
+    """The rows (n,) that the sorted points of a workspace had in the order given."""
     return _by_point(workspace, POINT_AT.order, (workspace.n,), np.int64)
 
 
 @njit(nogil=True)
 def candidate_in(workspace):  # type: ignore[no-untyped-def]
-    """The present candidate in a workspace; see `Candidate`."""
+    """The candidate attitude under refinement in a workspace; see `Candidate`."""
     block, n = workspace
     return Candidate(
         _by_point(workspace, POINT_AT.match, (n,), np.int64),
@@ -306,7 +306,7 @@ def ledger_in(workspace):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def counters_in(workspace):  # type: ignore[no-untyped-def]
-    """The counters (5,) of a search in a workspace."""
+    """The counters (5,) of a lost-in-space search in a workspace."""
     return view_into(workspace.block, AT.counters, (5,), np.int64)
 
 

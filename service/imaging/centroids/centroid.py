@@ -49,7 +49,7 @@ SLOPE_LEAST = 0.2
 
 
 def profiles(square: Array, method: str) -> tuple[Array, Array]:
-    """The samples of a square along u and along v: its middle row and column, or its sums."""
+    """Sums of a square's columns and of its rows, or for a scan its middle row and column."""
     if method == "scan":
         middle = square.shape[0] // 2
         return square[middle, :], square[:, middle]
@@ -167,7 +167,7 @@ def _record(
 
 
 def _share_beyond(profile: Array) -> float:
-    """Relative error of a scan of finite length, 2 V <Phi(V)> / E, from the light at its ends.
+    """Relative error of a displacement by a scan that is cut off, from the light at its ends.
 
     The samples cover -V ... V, where V lies half a step beyond the last sample.
     """
@@ -325,7 +325,7 @@ VAGUE = 100.0
 def recursive_fit(
     window: Window, psf: Psf, start: tuple[float, float], half_width_px: int, recentre: bool = True
 ) -> shape_fit.Fit | None:
-    """A star fitted pixel by pixel, in passes until its place converges; None without light.
+    """A star fitted pixel by pixel, in passes until its place converges; None if it is lost.
 
     With `recentre` false there is one pass: the report's own form.
     """

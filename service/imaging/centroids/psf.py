@@ -31,7 +31,7 @@ class Psf(Protocol):
 
     @property
     def fwhm_px(self) -> float:
-        """The full width at half of the maximum, in pixels."""
+        """The full width of a star's image at half of its maximum, in pixels."""
 
     def pixel(self, du_px: npt.ArrayLike, dv_px: npt.ArrayLike) -> Array:
         """Share of the star's light on pixels whose centres lie (du, dv) pixels from the star."""
@@ -52,7 +52,7 @@ class GaussianPsf:
 
     @property
     def fwhm_px(self) -> float:
-        """The full width at half maximum of the Gaussian, before integration over the pixel."""
+        """The full width at half maximum of a Gaussian image, before integration over the pixel."""
         return 2.0 * math.sqrt(2.0 * math.log(2.0)) * self.sigma_px
 
     def pixel(self, du_px: npt.ArrayLike, dv_px: npt.ArrayLike) -> Array:

@@ -94,7 +94,7 @@ def first_flux(region: Region, psf: Psf, u_px: float, v_px: float) -> float:
 def fit(
     window: Window, psf: Psf, start: tuple[float, float], half_width_px: int, recentre: bool = True
 ) -> Fit | None:
-    """The place and light of a star by Gauss-Newton from a start in window pixels, or None."""
+    """The fit of a star's place and light by Gauss-Newton from a start; None if it fails."""
     u, v = start
     region = square_about(window, round(u), round(v), half_width_px)
     if region is None:
@@ -129,7 +129,7 @@ LEAST_RED_SHARE, MOST_RED_SHARE = -0.2, 1.3
 def fit_in_its_colour(
     window: Window, psf: Psf, start: tuple[float, float], half_width_px: int
 ) -> tuple[Fit | None, Psf]:
-    """The best fit of a star with a PSF of the star's own measured colour, and that PSF.
+    """The best fit of a star, or None, with a PSF of the star's own measured colour, and that PSF.
 
     The known distribution of star colours is used as a prior. Images of all colours are even and
     their slopes odd, so that an error of the colour hardly moves the star.

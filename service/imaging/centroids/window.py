@@ -310,9 +310,7 @@ def symmetric_square_about(window: Window, column: int, row: int, half: int) -> 
 
 
 def brightest_pixel(window: Window) -> tuple[int, int]:
-    """(column, row) of the middle of the brightest 3 x 3 pixels; counts are cut off at
-    saturation.
-    """
+    """(column, row) of the middle of a window's brightest 3 x 3 pixels, cut off at saturation."""
     # This module is imported at the service's start, which avoids scipy.
     from scipy.ndimage import correlate
 

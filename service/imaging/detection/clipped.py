@@ -55,7 +55,7 @@ class ClippedStars(NamedTuple):
 
 
 def clipped_stars(light: CountArray) -> ClippedStars | None:
-    """The clipped stars on light above its background (rows, columns); None where there are few."""
+    """Clipped stars on background-subtracted light; None for too few or too many clipped pixels."""
     level = LEVEL_SHARE * float(light.max(initial=0.0))
     full = light >= level
     pixels = int(np.count_nonzero(full))

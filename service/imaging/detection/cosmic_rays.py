@@ -26,7 +26,10 @@ cosmic-ray track is not taken for a star.
 """
 
 HIT_SHARE = 0.1
-"""Least height of a cosmic-ray hit over a star's brightest pixel; less may be a PSF error."""
+"""Least residual of a cosmic-ray hit, as a share of the brightest pixel of the star's model.
+
+Smaller ones may be errors of the PSF.
+"""
 
 _ASIDE = ((-1, 0), (1, 0), (0, -1), (0, 1))
 

@@ -78,7 +78,7 @@ def take_background_off(
 
 
 def _left(light: CountArray, mask: Mask | None) -> tuple[CountArray, CountArray, float]:
-    """Residual background of each coarse mesh, noise of each pixel, noise of the whole frame.
+    """Background left in each coarse mesh of a frame, noise of each pixel, noise of the frame.
 
     Computed from every other pixel.
     """

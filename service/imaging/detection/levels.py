@@ -15,7 +15,7 @@ _SAMPLES = 1 << 16
 _FEW_LEVELS = 4
 _LEVELS_OF_8_BITS = 255.0
 _ROUNDING_BITS = 20
-"""Rounding error of single-precision transforms: so many bits below the largest count."""
+"""Bits below the largest count at which single-precision transforms have rounding errors."""
 _LEAST_RANGE, _MOST_RANGE = 2.0**-10, 2.0**40
 _WHOLE_BITS = 16
 

@@ -166,7 +166,7 @@ def chosen_stars(
 
 
 def _by_magnitude_else_light(magnitude_mag: float, flux_counts: float) -> tuple[bool, float]:
-    """The sort key of a star: by magnitude, and those without one last, by decreasing light."""
+    """The sort key of a star: by magnitude, and by decreasing light after all with a magnitude."""
     if math.isnan(magnitude_mag):
         return True, -flux_counts if flux_counts > 0.0 else math.inf
     return False, magnitude_mag

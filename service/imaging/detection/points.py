@@ -249,7 +249,7 @@ def _trails(
     v: npt.NDArray[np.int64],
     ratio: Vector,
 ) -> Trails | None:
-    """The trails of the stars if the clearest peaks are elongated alike; else None."""
+    """The star trails, if the clearest peaks are elongated alike and fit one motion; else None."""
     clear = np.argsort(-ratio, kind="stable")[:TRAIL_PEAKS]
     clear = clear[ratio[clear] > 2.0 * FIRST_THRESHOLD]
     u, v = u[clear], v[clear]

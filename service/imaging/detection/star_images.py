@@ -214,7 +214,7 @@ ROUNDS = 4
 FAR_FWHMS = 1.2
 """Distance from a star, in widths of its image, beyond which light belongs to the tails."""
 TAIL_NOISES = 0.5
-"""A star is subtracted if the brightest pixel of its tails is above this many sigmas of noise."""
+"""Least level of a star's tails at their brightest pixel, in sigmas of noise, for subtraction."""
 DOUBT = 0.03
 """Error of a subtracted image from an inexact PSF, as a share of its light."""
 SAME_PX = 2.5
@@ -359,7 +359,7 @@ class ImageSearch:
         images.stars[number] = placed
 
     def _placed(self, window: Window, at: tuple[float, float], psf: Psf) -> StarImage | None:
-        """The best fit of a star in a window; None where the light is too faint to fit."""
+        """The image of the star fitted in a window; None where its light is too faint to fit."""
         start = at[0] - window.corner_u_px, at[1] - window.corner_v_px
         found, psf = fit_in_its_colour(window, psf, start, self._half)
         if found is None or not found.signal_ratio >= BREAKDOWN_RATIO:
@@ -399,7 +399,7 @@ class ImageSearch:
 
     @cached_property
     def _rims(self) -> list[tuple[int, float]]:
-        """Half widths of a star's image, with the largest share of light on the square's rim."""
+        """Half widths of squares about a star, each with the largest share of light on its rim."""
         still, halves = still_psf(self.camera), [reach_px(self.camera)]
         while halves[-1] > 4 * self._half:
             halves.append(halves[-1] // 2)
@@ -432,6 +432,6 @@ def _core_of(light: CountArray, u: float, v: float) -> float:
 
 
 def _without_residue(images: StarImages, found: npt.NDArray[np.void]) -> npt.NDArray[np.void]:
-    """The candidates that are not residuals of a subtracted star."""
+    """The candidates that are not residuals of a subtracted star, as rows of SEP."""
     places = zip(found["x"].tolist(), found["y"].tolist(), strict=True)
     return found[np.array([not _near(images, u, v) for u, v in places], dtype=np.bool_)]

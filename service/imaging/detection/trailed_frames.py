@@ -52,7 +52,7 @@ def trails_of_frame(
     rates_deg_per_s: Vector,
     exposure_s: float,
 ) -> Trails | None:
-    """Star trails on a frame; None where they are short, or where the camera's images reach far.
+    """The star trails on a frame; None for still stars, and for cameras with no Gaussian image.
 
     Raises `BadFile` where the motion of stars does not allow a place at mid exposure.
     """

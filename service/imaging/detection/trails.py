@@ -228,9 +228,7 @@ def _fitted(
     usable: npt.NDArray[np.bool_] | None,
     found: npt.NDArray[np.void],
 ) -> Trails:
-    """Trails with motion and width refined on the pixels of bright trails, and with a reason for
-    refusal if the fit is bad.
-    """
+    """Trails refined on the pixels of bright trails, with the reason to refuse a bad fit."""
     u, v = found["x"].astype(np.float64), found["y"].astype(np.float64)
     along_u, along_v, _ = trails.motion.trails(u, v)
     told = (along_u + 1j * along_v) ** 2
@@ -348,9 +346,7 @@ def _mean_light_px(trails: Trails, pixels: TrailPixels, placed: TrailPlaces) -> 
 
 
 LEAST_CLEAR, LEAST_DRAWN_OUT, LEAST_COHERENCE = 8, 0.15, 0.6
-"""Criteria for trailed images: their least number, least ellipticity, and least share of it that is
-smooth over the picture.
-"""
+"""Criteria for trailed images: least number, ellipticity, and smoothness over the picture."""
 
 
 def may_trail(
@@ -376,7 +372,7 @@ TWIN_REACH_SHARE, TWIN_GATE_PX, TWIN_RATIO = 0.125, 1.0, 1.35
 
 
 def twin_distance_px(u_px: Vector, v_px: Vector, flux: Vector, side_px: int) -> float | None:
-    """Distance in pixels of the two images that every star has; None for single images.
+    """Distance in pixels of the two images that every star has; None without such twins.
 
     Stars (n) are given the clearest first. All pairs have the same displacement and ratio of light.
     """

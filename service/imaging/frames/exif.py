@@ -45,14 +45,14 @@ class Entry(NamedTuple):
         return self.number * (_TYPE_BYTES[self.kind] if known else 8)
 
     def whole(self, order: str) -> int:
-        """The value of a tag that holds one whole number."""
+        """The value of a TIFF tag that holds one whole number."""
         is_long = len(self.value) == 8 and self.kind not in (3, 4)
         form = "H" if self.kind == 3 else "Q" if is_long else "L"
         return int(struct.unpack_from(order + form, self.value)[0])
 
 
 def directory(file: BoundedFile, order: str, at: int, big: bool = False) -> list[Entry]:
-    """The entries of a TIFF directory at an offset; raises `struct.error` if the file ends."""
+    """The entries of a TIFF directory at an offset; raises `struct.error` if cut off or huge."""
     file.seek(at)
     (count,) = struct.unpack(order + ("Q" if big else "H"), file.read(8 if big else 2))
     form, size = (order + "HHQ8s", 20) if big else (order + "HHL4s", 12)
@@ -64,7 +64,7 @@ def directory(file: BoundedFile, order: str, at: int, big: bool = False) -> list
 def bytes_beyond(
     file: BoundedFile, order: str, entries: list[Entry], depth: int = 2, big: bool = False
 ) -> int:
-    """The total size of the tags in all directories that entries point to, recursively."""
+    """The total size of the tags in all directories that a TIFF's entries point to, recursively."""
     total = 0
     # Of several entries with one tag the first counts.
     for tag, entry in {entry.tag: entry for entry in reversed(entries)}.items():
@@ -92,7 +92,7 @@ def require_small_exif(file: BoundedFile) -> None:
 
 
 def exif_of(image: Any) -> Mapping[int, Any]:
-    """The EXIF tags of an image; empty if it has none or too many."""
+    """EXIF tags of an image; empty if there are none, if they are too large, or cannot be read."""
     if not _is_small(image):
         return {}
     try:
@@ -129,7 +129,7 @@ def exposure_of(image: Any) -> tuple[str | None, float | None]:
 def exif_exposure(
     taken: object, offset: object, fraction: object, exposure: Any
 ) -> tuple[str | None, float | None]:
-    """The UTC of mid exposure and the exposure in seconds from the values of four EXIF tags."""
+    """The UTC of mid exposure, and the exposure in seconds, from four EXIF values; None if bad."""
     exposure_s = None
     with suppress(TypeError, ValueError, ZeroDivisionError, OverflowError):
         pair = exposure if isinstance(exposure, tuple) else (exposure, 1)
@@ -159,7 +159,7 @@ def _utc(taken: object, offset: object, fraction: object, exposure_s: float | No
 
 
 def _is_small(image: Any) -> bool:
-    """True if an image's EXIF block is small enough to be parsed."""
+    """True unless an image's EXIF block is too large to be parsed."""
     exif = image.info.get("exif", b"")
     if len(exif) > MAX_EXIF_BYTES:
         return False
@@ -213,7 +213,7 @@ def is_by_rows(frame: Frame) -> bool:
 
 
 def mirrored(frame: Frame) -> Frame:
-    """A frame with its mirror image, with a note in its orientation."""
+    """The mirror image of a frame, noted in its orientation."""
     by_rows = is_by_rows(frame)
     counts = frame.counts[::-1] if by_rows else frame.counts[:, ::-1]
     how = "top and bottom" if by_rows else "left and right"

@@ -78,7 +78,7 @@ def read_npy(file: BoundedFile, limits: FrameLimits, digest: str) -> Frame:
 def _chosen_plane(
     shape: tuple[int, ...], choice: str | None
 ) -> tuple[int | None, int | None, tuple[str, ...]]:
-    """The axis of an array's planes, the chosen plane counted from 0, and remarks.
+    """The axis of an array's planes, the chosen plane (from 0), each or None, and remarks.
 
     Without an explicit choice, three planes are colours to sum. Raises `BadFile` for another number
     of axes, and for several planes without a choice.

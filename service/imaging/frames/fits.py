@@ -91,7 +91,7 @@ def _images(file: BoundedFile) -> tuple[list[fits_header.Unit], fits_header.Head
 def _chosen(
     images: Sequence[fits_header.Unit], choice: str | None
 ) -> tuple[fits_header.Unit, int | None, tuple[str, ...]]:
-    """The chosen image unit, its chosen plane or None, and remarks that name the other images."""
+    """The chosen FITS unit with an image, the number of its chosen plane or None, and remarks."""
     named = ", ".join(f"{each.number} {each.header.name}".strip() for each in images[:MAX_NAMED])
     if choice is None:
         if len(images) == 1:
@@ -110,7 +110,7 @@ def _chosen(
 
 
 def _planes(header: fits_header.Header, plane: int | None) -> tuple[list[int], bool]:
-    """The planes of an image to sum, from 0, and true if colours are interleaved by pixel."""
+    """The planes of a FITS image to sum, from 0, and true if its colours alternate by pixel."""
     axes = header.image_axes
     count = 1
     for length in axes[2:]:
@@ -145,12 +145,12 @@ class _Plain:
         self._scaling = _scaling(unit.header)
 
     def plane(self, number: int) -> CountArray:
-        """One plane (rows, columns) of an uncompressed FITS image; planes count from 0."""
+        """One plane (rows, columns) of counts of an uncompressed FITS image; planes from 0."""
         width, height = self._unit.header.image_axes[:2]
         return self._counts(self._read(number * width * height, width * height), (height, width))
 
     def interleaved(self) -> CountArray:
-        """The sums of the colours of each pixel (rows, columns), for interleaved colours."""
+        """The sums of each pixel's colours (rows, columns) in an uncompressed FITS image."""
         colours, width, height = self._unit.header.image_axes
         stored = self._read(0, colours * width * height)
         return np.asarray(self._counts(stored, (height, width, colours)).sum(axis=2))
@@ -196,7 +196,7 @@ class _Compressed:
         return self._section(number)
 
     def interleaved(self) -> CountArray:
-        """The sums of the colours of each pixel (rows, columns), for interleaved colours."""
+        """The sums of each pixel's colours (rows, columns) in a tile-compressed FITS image."""
         return np.asarray(self._section(None).sum(axis=2))
 
     def _section(self, number: int | None) -> CountArray:

@@ -29,7 +29,7 @@ _COPIED = re.compile(
     r"(TTYPE|TFORM|ZNAME|ZVAL)\d+|Z(CMPTYPE|QUANTIZ|DITHER0|BLANK|SCALE|ZERO))"
 )
 _NUMBER_BYTES = 8
-"""Size in bytes of the largest number type in a picture."""
+"""Size in bytes of the largest number type that a compressed FITS image can have."""
 _SPARE_BYTES = 4096
 _FORM = re.compile(r"(\d{0,9})([A-Z])(?:([A-Z])\(\d*\))?")
 _BYTES = dict(zip("LXBIJKAEDCMPQ", (1, 1, 1, 2, 4, 8, 1, 4, 8, 8, 16, 8, 16), strict=True))
@@ -116,7 +116,7 @@ def _require_bounded(header: Header, data: bytes, tile_pixels: int) -> None:
 def _columns(
     header: Header, table: npt.NDArray[np.uint8]
 ) -> Iterator[tuple[str, int, npt.NDArray[np.int64]]]:
-    """Array columns of a compressed table: name, bytes per number, counts and offsets (rows, 2)."""
+    """Columns of arrays in a compressed FITS table: name, bytes per number, counts and offsets."""
     at = 0
     for number in range(1, header.whole("TFIELDS") + 1):
         text = str(header.cards.get(f"TFORM{number}") or "").strip()

@@ -28,14 +28,12 @@ OBSERVED = ("DATE-OBS", "MJD-OBS")
 TIMES_OF_DAY = ("TIME-OBS", "UT")
 """FITS keywords of a time of day that completes a date without one."""
 UTC_OFFSETS = ("UTCOFFS", "UTC-OFFS", "UTCOFF", "UTC-OFF", "UTCOFFSE", "UTC_OFFS")
-"""FITS keywords of the hours by which local time is ahead of UTC."""
+"""FITS keywords of the hours by which a header's local time is ahead of UTC."""
 LONGEST_EXPOSURE_S = 3600.0
 SAME_S = 1.0
 """Largest difference, in seconds, between two times for the same moment of an exposure."""
 MOST_RATIO = 100.0
-"""Least ratio of two stated exposures from which one must be in another unit; dead times and sums
-of frames differ by less.
-"""
+"""Least ratio of two stated exposures from which one must be in another unit."""
 MOST_OFFSET_H = 14.0
 _UNITS_S = {
     **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), 1.0),
@@ -86,8 +84,7 @@ _OTHER_SIGN = re.compile(r"\b(add|added|minus|subtract|to utc|to ut)\b")
 
 @dataclass(frozen=True)
 class HeaderTime:
-    """The UTC of mid exposure as text and the exposure in seconds from a FITS header, or the reason
-    for no time.
+    """The UTC of mid exposure and the exposure by a FITS header, or the reason for no time.
 
     The sources name the keywords from which time and exposure were taken.
     """
@@ -427,7 +424,7 @@ def _has(header: Header, keys: Iterable[str]) -> bool:
 
 
 def _agreed(moments: dict[str, Utc]) -> Utc | None:
-    """First of several moments that must agree; raises `_NoTime` if another one contradicts it."""
+    """First of several moments that must agree, or None; raises `_NoTime` if another differs."""
     for key, moment in moments.items():
         first = next(iter(moments))
         apart_s = _seconds_between(moments[first], moment)
@@ -441,7 +438,7 @@ def _seconds_between(one: Utc, other: Utc) -> float:
 
 
 def _read(text: str, clock: str | None, scale: str) -> Utc | None:
-    """The UTC of a date and its time of day, which may come from another card; None for no date."""
+    """The UTC of a date and time of day, from one FITS card or two; None if it cannot be read."""
     old, date = _OLD_DATE.fullmatch(text), _DATE.fullmatch(text)
     if old is not None:
         year, month, day = 1900 + int(old[3]), int(old[2]), int(old[1])

@@ -128,7 +128,7 @@ def _read_header(segment: bytes, is_progressive: bool, max_pixels: int) -> _Pict
 
 
 def _parts(data: bytes, at: int) -> tuple[list[tuple[int, bytes]], int]:
-    """The coded data of a JPEG scan between restart markers, with these, and the end offset."""
+    """The coded pieces of a JPEG scan, each with the restart marker before it, and their end."""
     parts: list[tuple[int, bytes]] = []
     before = -1
     for found in _MARKER.finditer(data, at):
@@ -229,7 +229,7 @@ def _bits(coded, at):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def _behind(coded, at, unit, kind, tables, known, block, run):  # type: ignore[no-untyped-def]
-    """The bit offset after a coded JPEG block; -1 where the data begin with no valid code."""
+    """The bit offset after a coded JPEG block; -1 if its data hold an invalid code."""
     k, last, refines, progressive = kind
     if k == 0:
         if refines:

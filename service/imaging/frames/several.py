@@ -14,7 +14,7 @@ from service.imaging.frames.frame import FrameLimits, bad_frame
 
 MAX_IMAGES = 256
 MAX_DECODED = 16
-"""Limit for decoding an animation from its beginning, in multiples of a frame's pixels."""
+"""Limit for decoding an animation up to one image, in multiples of a frame's largest size."""
 
 
 class Subfile(NamedTuple):
@@ -26,7 +26,7 @@ class Subfile(NamedTuple):
 
 
 def chosen_image(subfiles: list[Subfile], choice: str | None) -> tuple[int, tuple[str, ...]]:
-    """The index of the image that is the frame, counted from 0, and remarks on the choice.
+    """The index (from 0) of the image in a file that is the frame, and remarks on the choice.
 
     Raises `BadFile` where several images qualify and none is chosen; choices count from 1.
     """

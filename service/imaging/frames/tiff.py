@@ -46,7 +46,7 @@ _DESCRIPTION, _SAMPLES, _META_MORPH = 270, 277, 33629
 _WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _FILTER_PATTERN, _LINEAR_RAW = 0, 1, 2, 32803, 34892
 _GREYS = (_WHITE_IS_ZERO, _BLACK_IS_ZERO, _FILTER_PATTERN)
 _BY_PILLOW = {3: "palette", 5: "CMYK", 6: "YCbCr"}
-"""Photometric interpretations of 8-bit TIFF pages that Pillow converts to red, green and blue."""
+"""Photometric interpretations of TIFF by number, which Pillow converts to red, green and blue."""
 _PLAIN, _JPEG, _PACK_BITS = 1, 7, 32773
 _UNPACKED = {5, 8, _PACK_BITS, 32946, 34925, 50000}
 """TIFF compression codes that are read: LZW, deflate, PackBits, deflate, LZMA, Zstandard."""
@@ -316,7 +316,7 @@ def _require_whole_segments(page: Any, file: BoundedFile, limits: FrameLimits) -
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int]:
-    """Columns and rows stated by the header of JPEG data."""
+    """Columns and rows of the picture, as stated by the header of JPEG data."""
     at = 2
     while True:
         marker, length = struct.unpack_from(">HH", data, at)

@@ -58,7 +58,7 @@ class Part(Struct, frozen=True, kw_only=True):
     batches: int
     results: int
     first: str
-    """UTC of the earliest batch in the part."""
+    """UTC time of the earliest batch in the archive part."""
     last: str
     first_ns: int
     last_ns: int
@@ -83,11 +83,11 @@ class Manifest(Struct, frozen=True, kw_only=True):
     parts: list[Part]
 
     def with_part(self, part: Part) -> "Manifest":
-        """Copy of the manifest with a part added, replacing one of the same file."""
+        """Copy of an archive manifest with a part added, replacing one of the same file."""
         return structs.replace(self, parts=[*self.without(part).parts, part])
 
     def without(self, part: Part) -> "Manifest":
-        """Copy of the manifest without a part."""
+        """Copy of an archive manifest without one of its parts."""
         return structs.replace(self, parts=[each for each in self.parts if each.file != part.file])
 
 
@@ -103,7 +103,7 @@ class Settings(Struct, frozen=True, kw_only=True):
 
     digest: str
     row: dict[str, Any]
-    """Row of the settings or the catalog in the database."""
+    """Database row of the settings or the catalog, by column."""
 
 
 @contextmanager
@@ -226,7 +226,7 @@ def whole_content(folder: Path, path: str, sha256: str) -> bytes:
 
 
 def settings_file(folder: Path, digest: str) -> Path:
-    """File with a mission's settings or a catalog, by digest."""
+    """Path of the file with a mission's settings or a catalog in an archive, by digest."""
     return folder / "settings" / f"{digest.replace(':', '-')}.json"
 
 

@@ -30,7 +30,7 @@ CACHE_BYTES = 64 << 20
 
 @dataclass(frozen=True)
 class PlacedPart:
-    """Archive part with batches of the database, and the times of its first and last batch."""
+    """Record of an archive part: file, digest, number of batches, times of the first and last."""
 
     id: int
     path: str
@@ -172,7 +172,7 @@ class Archive:
 
     @contextmanager
     def _readable(self, path: str) -> Iterator[Path]:
-        """Provide the file of an archive part; errors are raised with the remedy."""
+        """Context manager with the path of an archive part's file; read errors get a remedy."""
         require_extra("tables", "pyarrow", "archive", path)
         import pyarrow as pa
 

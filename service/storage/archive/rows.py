@@ -138,7 +138,7 @@ def _without_copies(columns: Columns) -> Columns:
 
 
 def _copies(columns: Columns | pa.Table) -> Columns:
-    """Predict values that usually follow from other columns, by the predicted column."""
+    """Values that usually equal or follow from other columns, by name of the predicted column."""
     digests = [hashlib.sha256(each.encode()).hexdigest() for each in columns["input"].to_pylist()]
     return {
         "batch_id": columns["id"],
@@ -314,7 +314,7 @@ class Opened:
                 _insert(connection, table, values)
 
     def add_rows(self, rows: Rows) -> None:
-        """Add rows of the recorded database."""
+        """Add rows of recorded batches and results to the database in memory."""
         with self._engine.begin() as connection:
             for table in (batches, results, *_CHILD_TABLES):
                 read = rows[table.name]
@@ -322,7 +322,7 @@ class Opened:
                 _insert(connection, table, columns)
 
     def add_settings(self, found: Iterable[Settings]) -> None:
-        """Add rows of missions' settings."""
+        """Add the settings of missions to the database in memory."""
         with self._engine.begin() as connection:
             for each in found:
                 connection.execute(missions.insert().prefix_with("OR IGNORE"), each.row)

@@ -46,7 +46,7 @@ MOST_LEAVES = 2_000
 ADOPTED_AT_ONCE = 500
 """Results of earlier versions that get a leaf in one transaction."""
 _HOUR = len("2026-03-01T12")
-"""Length of a time's text up to its hour; the first head of each hour is sent as an event."""
+"""Number of results of earlier versions that get a leaf of the chain in one transaction."""
 LATE_S = 3_600.0
 """Longest duration in seconds of a transaction that adds a row to a bound table."""
 
@@ -62,11 +62,11 @@ class HeadMaker:
     _bound: int = 0
     """Position up to which results are bound into the chain, as far as this process knows."""
     _seen: dict[Table, tuple[float, object]] = field(default_factory=dict)
-    """Greatest key of each table whose older rows are all facts, with the time of that finding."""
+    """Greatest key in each table up to which all rows are facts, and the time of that finding."""
     _seen_now: dict[Table, tuple[float, object]] = field(default_factory=dict)
 
     def is_due(self, position: int) -> bool:
-        """True if another head is due at the projector's position."""
+        """True if a head of the record is due: by time, or since enough results were added."""
         return time.monotonic() >= self._due_s or position - self._bound >= MOST_LEAVES
 
     def make(self, connection: Connection, position: int) -> Statement | None:
@@ -216,7 +216,7 @@ def contents(connection: Connection, made: Sequence[Row]) -> Iterator[tuple[Row,
 
 
 def _adopt(connection: Connection) -> int:
-    """Give some results without a place in the record a negative place and a leaf; counted."""
+    """Give some results without a place in the record a negative place; returns their number."""
     # Results without a digest get one first.
     chosen = select(results).where(results.c.seq == 0, results.c.digest.is_not(None))
     made = rows_of(connection, chosen.limit(ADOPTED_AT_ONCE))

@@ -134,7 +134,7 @@ class _Step:
 
 @dataclass(frozen=True)
 class _Gap:
-    """Gap between two places of the record, with the number of the next transaction then."""
+    """Gap between two places in the record, with the next transaction's number when found."""
 
     before: int
     after: int

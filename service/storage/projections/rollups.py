@@ -83,7 +83,7 @@ class RecordedResult(Struct, eq=False, dict=True):
 
     @property
     def owner(self) -> tuple[str, str]:
-        """Run and spacecraft of the result."""
+        """Run and spacecraft to which the result belongs."""
         return self.result["run"], self.result["spacecraft"]
 
     @property
@@ -274,7 +274,7 @@ def _put(found: Rollups, key: Any, row: Row) -> None:
 
 
 def stored(connection: Connection, bucket: Bucket, *, of_trackers: bool = False) -> Rollups:
-    """Stored trends of all spacecraft, or of their trackers."""
+    """Stored trends by hour or by day, of all spacecraft or of their trackers."""
     trend = TRENDS[bucket]
     table, names = (trend.tracker_table, _TRACKER_KEY) if of_trackers else (trend.table, _KEY)
     return {
@@ -313,7 +313,7 @@ def recount(connection: Connection, bucket: Bucket, *, of_trackers: bool = False
 
 
 def hours_of_all(connection: Connection) -> set[BucketKey]:
-    """All hours with batches, recorded or archived, or with a trend."""
+    """Keys of all hours with batches, recorded or archived, or with a trend."""
     hour = func.substr(batches.c.time, 1, len("2026-11-27T12"))
     columns = batches.c.spacecraft, batches.c.run
     query = select(*columns, func.min(batches.c.time)).group_by(*columns, hour)
@@ -328,7 +328,7 @@ def hours_of_all(connection: Connection) -> set[BucketKey]:
 
 
 def waiting(connection: Connection, bucket: Bucket) -> set[BucketKey]:
-    """Hours or days with results that the projector has not reached."""
+    """Keys of the hours or days with results that the projector has not reached."""
     query = select(results.c.spacecraft, results.c.run, batches.c.time).join_from(
         results, batches, results.c.batch_id == batches.c.id
     )

@@ -29,7 +29,7 @@ SUMMED_BITS = (1 << 40) - 1
 """Mask for the summed bits of each digest: eight million sums fit in 63 bits."""
 
 Seal = tuple[str, str, int]
-"""Key of a seal: (spacecraft, run, hour of TAI)."""
+"""Key of a seal: (spacecraft, run, number of the hour in TAI)."""
 _OWN = (results.c.spacecraft, results.c.run, results.c.time_ns // HOUR_NS)
 
 

@@ -192,7 +192,7 @@ def _pairs(selected: pages.ResultFilter, other: str, latest: int | None = None) 
 
 
 def _transitions(connection: Connection, pairs: Subquery) -> dict[tuple[str, str, bool], int]:
-    """Number of stars by old outcome, new outcome, and whether the catalog star is the same."""
+    """Number of stars by outcome in one run and in the other, and by equality of catalog star."""
     old, new = tables.star_results.alias("old_star"), tables.star_results.alias("new_star")
     same = case((old.c.star_id == new.c.star_id, 1), else_=0)
     query = (
@@ -238,7 +238,7 @@ def _angles_arcsec(connection: Connection, pairs: Subquery) -> list[Vector]:
 
 
 def _between(rows: Vector) -> Vector:
-    """Angle in arcsec between two quaternions a row (n, 8); accurate near zero."""
+    """Angles (n,) in arcsec between the two quaternions in each row (n, 8); accurate near zero."""
     one, other = rows[:, :4], rows[:, 4:]
     apart = np.minimum(np.linalg.norm(one - other, axis=1), np.linalg.norm(one + other, axis=1))
     return np.asarray(4.0 * np.arcsin(np.minimum(1.0, apart / 2.0)) * ARCSEC_PER_RADIAN)

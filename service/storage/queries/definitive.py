@@ -41,7 +41,7 @@ BLOCKS = select(
     graded_blocks.c.packed,
 ).join_from(graded_days, graded_blocks, graded_blocks.c.day_id == graded_days.c.id)
 MOST_BLOCKS = 48
-"""Largest number of blocks that are read of filtered or smoothed attitudes, or of innovations.
+"""Largest number of blocks read of filtered or smoothed attitudes, or of their innovations.
 
 They are two days at 1 Hz; of a longer period, blocks spread over it are read.
 """
@@ -51,7 +51,7 @@ class DefinitiveStretchInfo(Struct, frozen=True, kw_only=True):
     """Unbroken stretch of a day's attitude history with one model of motion."""
 
     model: str
-    """`gyro`, or `constant_rate` where no gyro runs: the rate is a random walk."""
+    """Model of motion: `gyro`, or without one `constant_rate`, whose rate is a random walk."""
     start: Moment
     end: Moment
     samples: Count
@@ -70,7 +70,7 @@ class DaySummary(Struct, frozen=True, kw_only=True):
         doc("Samples, gaps, samples beyond the largest rate, zeros while the body turned."),
     ]
     nis_per_degree: float | None
-    """Mean of z^T S^-1 z of the accepted measurements by degrees of freedom: about 1."""
+    """Mean of z^T S^-1 z of the accepted measurements per degree of freedom, expected to be 1."""
 
 
 def definitive_pages(
@@ -112,7 +112,7 @@ def count_samples_of(connection: Connection, selected: ResultFilter, grade: Grad
 
 
 def block_conditions(selected: ResultFilter, kind: str) -> list[ColumnElement[bool]]:
-    """SQL conditions for blocks of a grade or of innovations in a period; latest revisions."""
+    """SQL conditions for current blocks of a grade, or of innovations, that overlap a period."""
     days, blocks = graded_days.c, graded_blocks.c
     chosen: list[ColumnElement[bool]] = [
         days.current,
@@ -169,7 +169,7 @@ def _repeated(value: str | None, n: int) -> Any:
 
 @dataclass(frozen=True)
 class Block:
-    """Position of a block of samples, with its model and times in TAI nanoseconds."""
+    """Key of a stored block of samples, with its model of motion and times in TAI nanoseconds."""
 
     day_id: str
     position: int
@@ -181,7 +181,7 @@ class Block:
 def latest_innovations(
     connection: Connection, selected: ResultFilter, *, of_gyro: bool = False
 ) -> list[MeasuredInnovations]:
-    """Innovations of a period's latest blocks, or latest gyro blocks, in order of time."""
+    """Innovations of a period from its latest blocks, or from those with a gyro, in time order."""
     blocks = blocks_of(connection, selected, INNOVATIONS)
     blocks = [each for each in blocks if each.model == "gyro" or not of_gyro]
     rows = packed_samples(connection, INNOVATIONS, blocks[-MOST_BLOCKS:])
@@ -190,7 +190,7 @@ def latest_innovations(
 
 
 def blocks_of(connection: Connection, selected: ResultFilter, kind: str) -> list[Block]:
-    """List the blocks that overlap a period without their samples, in order of time."""
+    """List the blocks that overlap a period, without their samples, in order of time."""
     c = graded_blocks.c
     query = (
         select(c.day_id, c.position, c.model, c.start_ns, c.end_ns)
@@ -216,7 +216,7 @@ _COUNTED = (Outcome.ACCEPTED, Outcome.REJECTED, Outcome.STARTED)
 
 
 def rejected_samples(connection: Connection, selected: ResultFilter) -> list[Sample]:
-    """Samples for the rejected share of a period's measured attitudes, in order of time."""
+    """One sample of 1 or 0 per measured attitude of a period: rejected by the filter or not."""
     found: list[Sample] = []
     for part in latest_innovations(connection, selected):
         counted = np.isin(part.outcome, _COUNTED)

@@ -127,7 +127,7 @@ class FleetCells:
     """POSIX time at which the first cell begins, in seconds."""
     width_s: int
     counts: Mapping[str, Matrix]
-    """Counts by the name of a rollup column, such as `observed`; 0 where there was no batch."""
+    """Star and batch counts (spacecraft, cells) by name, such as `observed`; 0 without a batch."""
 
     @property
     def columns(self) -> int:
@@ -141,7 +141,7 @@ class Fleet:
 
     run: str
     as_of: Utc | None
-    """Time of the run's latest batch."""
+    """Time of the newest batch of the run's spacecraft; far-ahead live ones count only alone."""
     alarms: AlarmSummary
     rows: tuple[FleetRow, ...]
     cells: FleetCells | None
@@ -180,7 +180,7 @@ def present_rank(alarm: Alarm) -> tuple[bool, int]:
 
 
 def summary(found: Sequence[Alarm]) -> AlarmSummary:
-    """Count active alarms by state, with the present severity of the worst one."""
+    """Count active alarms by state, with the present severity of the worst that is not shelved."""
     states = ("open", "acknowledged", "shelved")
     worst = max(found, key=present_rank, default=None)
     return AlarmSummary(
@@ -269,7 +269,7 @@ def _newest_query(solved: bool) -> Select[Any]:
 
 
 def latest_inputs(connection: Connection, names: Iterable[str], now: Utc) -> Sequence[str]:
-    """Latest live batch of each named spacecraft, as JSON in the form in which it was sent."""
+    """Latest live batch of each named spacecraft, as its recorded canonical JSON; in no order."""
     ids = _latest_ids(connection, list(names), LIVE, now)
     query = select(batches.c.input).join_from(results, batches, results.c.batch_id == batches.c.id)
     return connection.scalars(query.where(results.c.id.in_(list(ids.values())))).all()
@@ -325,7 +325,7 @@ def _root(variance: float) -> float:
 def _last_hours(
     connection: Connection, names: list[str], run: str, as_of: Utc
 ) -> dict[str, WindowCounts]:
-    """Counts by spacecraft over the hour that ends with the run's latest batch."""
+    """Star and batch counts by spacecraft over the hour that ends with the run's latest batch."""
     # The window includes the latest batch, and excludes one exactly an hour before it.
     end = shifted(as_of, _TICK_S)
     start = shifted(end, -HOUR_S)
@@ -361,7 +361,7 @@ def _cells(
 def _table(
     names: list[str], rows: Iterable[tuple[Any, ...]], as_of: Utc, span_s: int, width_s: int
 ) -> FleetCells:
-    """Arrange sums in a table with a row for each spacecraft and a column for each time cell."""
+    """Arrange counts in tables with a row for each spacecraft and a column for each time cell."""
     end_s = float(unix_seconds([as_of.tai_ns])[0])
     start_s = (end_s - span_s) // width_s * width_s + width_s
     place = {name: k for k, name in enumerate(names)}
@@ -379,7 +379,7 @@ def _table(
 def _hours(
     connection: Connection, names: list[str], run: str, as_of: Utc, span_s: int, width_s: int
 ) -> _Sums:
-    """Sums by spacecraft and cells of whole hours, from the rollups."""
+    """Star and batch counts by spacecraft and cell of whole hours, from the hourly rollups."""
     table, hours = tables.rollups_hourly.c, width_s // HOUR_S
     first = shifted(as_of, -span_s).bucket(HOUR_S)
     cell = (table.bucket // hours).label("cell")
@@ -400,7 +400,7 @@ def _hours(
 
 
 def _days(connection: Connection, names: list[str], run: str, as_of: Utc) -> dict[str, DayCounts]:
-    """Counts by spacecraft of the latest 24 hours of a run, and of the 24 hours before."""
+    """Star counts by spacecraft of the latest 24 hours of a run, and of the 24 hours before."""
     last_s = float(unix_seconds([as_of.tai_ns])[0]) // HOUR_S * HOUR_S
     found: dict[str, DayCounts] = {}
     for name, at_s, *counts in _hours(connection, names, run, as_of, 2 * DAY_S, HOUR_S):
@@ -432,7 +432,7 @@ _STEPS = (
 def _steps(
     connection: Connection, names: list[str], run: str, as_of: Utc, span_s: int, width_s: int
 ) -> _Sums:
-    """Sums by spacecraft and cells shorter than an hour, from the batches."""
+    """Star and batch counts by spacecraft and cell shorter than an hour, from the batches."""
     end = shifted(as_of, _TICK_S)
     found: list[tuple[Any, ...]] = []
     for midnight, asked in time_buckets.steps_by_day(shifted(end, -span_s), end, width_s):
@@ -447,7 +447,7 @@ def _steps(
 
 
 STEPS = {HOUR_S: 120, DAY_S: 1800}
-"""Width in seconds of a sparkline's buckets by its period: two minutes or half an hour."""
+"""Width in seconds of a sparkline's cells, by its period: two minutes for an hour, 30 for a day."""
 
 
 def overview(
@@ -478,7 +478,7 @@ def overview(
 
 
 def default_run(connection: Connection, spacecraft: Collection[str] | None = None) -> str:
-    """Run to show first: the live one, or if that is empty the newest that holds batches.
+    """Name of the run to show first: live, or the newest with batches if only other runs hold any.
 
     With `spacecraft`, only batches of these count.
     """

@@ -46,7 +46,7 @@ class Retired:
     """Recorded spacecraft and trackers that no mission file describes any more."""
 
     missions: dict[str, Mission] = field(default_factory=dict)
-    """Last settings of each retired spacecraft that has batches, by name."""
+    """Spacecraft and trackers with recorded data that no mission file describes any more."""
     trackers: dict[str, tuple[str, ...]] = field(default_factory=dict)
     """Trackers in earlier settings of a spacecraft but not in its last ones, by spacecraft."""
 
@@ -95,7 +95,7 @@ def live_state(connection: Connection, mission: Mission, run: str, now: Utc) -> 
 
 
 def mission_history(connection: Connection, spacecraft: str) -> list[MissionThen]:
-    """Settings with which a spacecraft was served, oldest first.
+    """All settings with which a spacecraft was served, each with its first use, oldest first.
 
     A return to earlier settings is a new entry.
     """
@@ -114,7 +114,7 @@ def mission_history(connection: Connection, spacecraft: str) -> list[MissionThen
 
 
 def retired(connection: Connection, missions_of_files: Mapping[str, Mission]) -> Retired:
-    """Find spacecraft with batches but without a mission file, and trackers in no mission file."""
+    """Find spacecraft with batches but no mission file, and trackers missing in last settings."""
     found = Retired()
     has_batches = exists().where(rollups_daily.c.spacecraft == mission_uses.c.spacecraft)
     query = (

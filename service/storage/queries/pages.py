@@ -121,7 +121,7 @@ Reading = Callable[[], AbstractContextManager[Connection]]
 MOST_OPENED = 40
 """Largest number of row groups opened for a page of a list: about a second's work."""
 FIRST_ID, LAST_ID = "0" * 26, "7" + "Z" * 25
-"""Ids that sort before and after all others."""
+"""Result ids that sort before and after every real one."""
 
 
 @dataclass(frozen=True)
@@ -265,7 +265,7 @@ class Listing:
         ]
 
     def _reaches(self, each: PlacedPart | Block, beyond: Place | None) -> bool:
-        """True if a part or row group may have rows of the filter after a position."""
+        """True if an archive part or row group may have rows of the filter after a position."""
         start_ns, end_ns = bounds_of(self.selected)
         if start_ns is not None and each.last_ns < start_ns:
             return False
@@ -328,7 +328,7 @@ def count_of_part(archive: Archive, part: PlacedPart, selected: ResultFilter) ->
 
 
 def bounds_of(selected: ResultFilter) -> tuple[int | None, int | None]:
-    """Start and end of a filter in ns of TAI; None for an open end."""
+    """Start and end of a result filter in ns of TAI; None for an open end."""
     return (
         None if selected.start is None else selected.start.tai_ns,
         None if selected.end is None else selected.end.tai_ns,

@@ -49,7 +49,7 @@ _FROM_NS = bindparam("from_ns", type_=BigInteger)
 
 @dataclass(frozen=True, eq=False)
 class PeriodAttitudes:
-    """Attitudes of the sampled batches of a period.
+    """Attitudes of the sampled batches (b) of a period, as arrays.
 
     `quaternion` (b, 4) is inertial to body, `covariance_arcsec2` (b, 3, 3) of the error rotation
     about the body axes.  `status` is `good`, `suspect` or `no_attitude`.  `follows` (b,) is True if
@@ -90,7 +90,7 @@ class TrackerStarsOfPeriod:
 
 @dataclass(frozen=True, eq=False)
 class PeriodStars:
-    """Stars of the sampled batches out of the `total` in a period: of all batches, or of some.
+    """Stars of the sampled batches of a period, by tracker; `total` counts all its batches.
 
     `other_catalog` counts the sampled batches that were identified with a star catalog which the
     service no longer has; their stars are left out.  `sun` (b, 3) are inertial directions to the
@@ -159,7 +159,7 @@ def sample_period(
 def _drawn_times_ns(
     unix_s: npt.NDArray[np.float64], count: npt.NDArray[np.float64], pairs: int
 ) -> list[int]:
-    """Draw a time in ns of TAI in each of `pairs` parts with equally many of the hours' batches."""
+    """Draw a random time (ns of TAI) in each of `pairs` parts of a period with as many batches."""
     rng = np.random.default_rng(0)
     rank = (np.arange(pairs) + rng.random(pairs)) * count.sum() / pairs
     before = np.concatenate([[0.0], np.cumsum(count)])
@@ -197,7 +197,7 @@ _UNKNOWN_DIRECTION = (np.nan, np.nan, np.nan)
 
 @dataclass
 class _Collected:
-    """Arrays of one tracker's stars under construction, batch by batch."""
+    """Lists of arrays for one tracker's stars, filled batch by batch."""
 
     tracker: Tracker
     boresight: list[Vector]

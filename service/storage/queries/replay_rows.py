@@ -16,7 +16,7 @@ MAX_LISTED = 100
 CANCELLED: runs.ReplayStateName = "cancelled"
 UNFINISHED: tuple[runs.ReplayStateName, ...] = ("running", "waiting")
 _NO_GYRO = {"gyro_blocks": 0, "gyro_samples": 0}
-"""Gyro counts of packets from an earlier version, which did not count them."""
+"""Gyro counts of a replay's packets recorded by an earlier version, which did not count them."""
 _NO_COUNTS = dict.fromkeys(runs.ReplayCounts.__struct_fields__, 0)
 
 

@@ -242,7 +242,7 @@ def measured(row: Any) -> dict[str, float | None]:
 
 @dataclass(frozen=True)
 class ResultPlace:
-    """Position of a result: its spacecraft, run and time, and the current result of its batch.
+    """Place of a result among others: spacecraft, run and time, and its batch's current result.
 
     Without a spacecraft the position is among the results of all spacecraft.
     """
@@ -298,11 +298,11 @@ class BatchSample:
     first: str | None
     last: str | None
     rows: tuple[Row, ...]
-    """Rows of the batches: result id, and input and options as stored."""
+    """Sampled rows, one per batch: the result's id, and input and options as stored."""
 
     @cached_property
     def batches(self) -> tuple[ObservationBatch, ...]:
-        """Decoded batches with the options of their results, in the order of the rows."""
+        """Sampled batches decoded, with the options of their results, in the order of the rows."""
         return tuple(batch_with_options(row["input"], row["options"]) for row in self.rows)
 
 

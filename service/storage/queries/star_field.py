@@ -30,7 +30,7 @@ from service.vectors import Matrix, Vector, read_only
 MARGIN = 1.25
 """Radius of a star chart, as a multiple of the radius of the field of view."""
 WIDEST_DEG = 15.0
-"""Largest extent of the picture, which grows if stars of the answer lie far outside."""
+"""Largest radius of a star chart in degrees, unless its field of view needs a larger one."""
 EDGE_STEP_DEG = 0.5
 
 
@@ -124,7 +124,7 @@ def star_field_of(
 def presumed_attitude(
     batch: ObservationBatch, answer: Answer, mission: Mission
 ) -> PriorAttitude | None:
-    """Attitude about which the stars were searched for; None if there was none."""
+    """Attitude about which stars were searched, or the one found in the whole sky; else None."""
     prior = batch.a_priori
     if answer.attitude is not None and answer.path != "zone":
         # The whole sky was searched, and gave the attitude.

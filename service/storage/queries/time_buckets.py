@@ -34,9 +34,9 @@ from service.vectors import Vector
 
 Bucket = Literal["hour", "day"]
 Columns = dict[str, Vector]
-"""Arrays by name: `unix_s`, at which each bucket begins, and columns of a rollup."""
+"""Columns of time buckets by name: `unix_s`, at which each begins, and sums of a rollup."""
 Names = tuple[str, ...]
-"""Names of rollup columns."""
+"""Names of the summed columns of a rollup table."""
 MAX_BATCHES_SUMMED = 10_000
 """Largest number of batches summed for an answer over hours; above it, rollups are read."""
 
@@ -87,7 +87,7 @@ def batches_about(connection: Connection, span: BucketFilter) -> int:
 
 
 def has_archived(connection: Connection, span: BucketFilter) -> bool:
-    """True if a span has archived batches, which only the rollups count."""
+    """True if an archive part overlaps a span, whose batches only the rollups count."""
     c = tables.archived_parts.c
     query = select(c.id).where(
         c.spacecraft == span.spacecraft,
@@ -101,7 +101,7 @@ def has_archived(connection: Connection, span: BucketFilter) -> bool:
 def read_buckets(
     connection: Connection, span: BucketFilter, level: Bucket, names: Names = tables.ROLLED_UP
 ) -> Columns:
-    """Buckets of a span in order of time; those without a batch are left out."""
+    """Sums by hour or day of a span in order of time, exact at its ends; without empty buckets."""
     width_s = TRENDS[level].width_s
     first = span.start.bucket(width_s)
     first += bucket_start(first, width_s).tai_ns < span.start.tai_ns
@@ -119,7 +119,7 @@ def read_buckets(
 
 
 def _finer(connection: Connection, span: BucketFilter, level: Bucket, names: Names) -> Columns:
-    """Buckets for a span without a whole day or hour: from hourly rollups, or from batches."""
+    """Sums over part of a day from its hours, or over part of an hour from its batches."""
     if level == "day":
         return read_buckets(connection, span, "hour", names)
     return read_steps(connection, span, HOUR_S, names)
@@ -142,7 +142,7 @@ def read_steps(
 
 
 def steps_by_day(start: Utc, end: Utc, width_s: int) -> Iterator[tuple[Utc, Row]]:
-    """Midnight of each day in a period, with the values for the queries of `STEP` and `IN_PERIOD`.
+    """Midnight of each day in a period, each with the named values for the queries of its batches.
 
     Each day is read by itself: between two days there may be a leap second.
     """
@@ -205,7 +205,7 @@ def _joined(parts: Sequence[Columns]) -> Columns:
 
 
 def _columns(rows: Sequence[Any], names: Names) -> Columns:
-    """Convert rows to columns; the first, `unix_s`, holds the number of the bucket."""
+    """Arrays by column name from rows; the first, `unix_s`, holds the number of the bucket."""
     # Convert to tuples: numpy would ask SQLAlchemy's rows for more than their values.
     table = np.array([tuple(row) for row in rows], dtype=float).reshape(-1, 1 + len(names))
     return dict(zip(("unix_s", *names), table.T, strict=True))
@@ -252,7 +252,7 @@ def _owner(span: BucketFilter) -> Row:
 def buckets_between(
     bucket: ColumnElement[int], start: Utc | None, end: Utc | None, width_s: int
 ) -> list[ColumnElement[bool]]:
-    """SQL conditions for the buckets that a period from `start` to before `end` overlaps."""
+    """SQL conditions for the hours or days that a period from `start` to before `end` overlaps."""
     chosen = []
     if start is not None:
         chosen.append(bucket >= start.bucket(width_s))

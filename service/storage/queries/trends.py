@@ -109,7 +109,7 @@ def _span(connection: Connection, request: HistoryRequest) -> BucketFilter | Non
 
 
 def _resolution(connection: Connection, span: BucketFilter, size: int) -> tuple[int, Source]:
-    """Narrowest bucket width that gives at most `size` points, and the source to read."""
+    """Width of a history's buckets that gives at most `size` points, and the table to read."""
     first_s, end_s = unix_seconds([span.start.tai_ns, span.end.tai_ns]).tolist()
     width_s = next((w for w in WIDTHS_S if _buckets(first_s, end_s, w) <= size), 0)
     if not width_s:
@@ -154,7 +154,7 @@ def _thinned(
 
 
 def _covered_h(unix_s: Vector, width_s: int, span: BucketFilter, counts: Vector) -> Vector:
-    """Hours of each bucket within the span; NaN for a bucket without a rate.
+    """Duration in hours of each bucket's part in the span; NaN where a rate would be unreliable.
 
     At the ends of a span, one batch more or less would double the rate of a few.
     """
@@ -165,7 +165,7 @@ def _covered_h(unix_s: Vector, width_s: int, span: BucketFilter, counts: Vector)
 
 
 class _Reduced:
-    """Narrow buckets merged into wider ones, each of which begins at a row in `first`."""
+    """Columns of narrow buckets merged into wider ones that begin at the rows `first`."""
 
     def __init__(self, cells: Columns, first: Integers, covered_h: Vector) -> None:
         self._cells, self._first, self._covered_h = cells, first, covered_h
@@ -384,7 +384,7 @@ def worst_batches(
 
 
 def _of_tracker(query: Select[Any], tracker: str | None) -> Select[Any]:
-    """Add the values of a tracker, if any, to a query over `results`."""
+    """Join the values of a tracker to a query over `results`; the same query for None."""
     if tracker is None:
         return query
     return query.select_from(OF_TRACKERS).where(tracker_values.c.tracker == tracker)
@@ -451,7 +451,7 @@ def _shown(
 def latest_prior_errors(
     connection: Connection, selected: ResultFilter, limit: int
 ) -> tuple[list[float], list[float]]:
-    """Angles in deg from a priori to found attitudes of the latest batches, and their sigmas.
+    """Angles in degrees from a priori to found attitudes of the latest batches, and their sigmas.
 
     They are in order from the newest batch; batches without either are left out.
     """

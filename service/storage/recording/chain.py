@@ -22,7 +22,7 @@ from service.storage.sql.statements import rows_of
 LEAF_BYTES = 16
 """Length of a leaf in bytes: to find another record with the same leaf takes 2^128 trials."""
 HELD_BYTES, LARGE_BYTES = 2_047, 65_536
-"""Largest input that Python hashes without releasing the interpreter's lock; largest hashed so.
+"""Largest input that Python hashes without releasing its lock, and largest hashed in pieces.
 
 Taking the lock back takes the writer longer than a hash of fewer than `LARGE_BYTES`.
 """
@@ -36,7 +36,7 @@ class Statement(msgspec.Struct, frozen=True, kw_only=True):
     version: int = 1
     number: int
     previous: str
-    """SHA-256 of the preceding statement in hexadecimal digits; empty in the first one."""
+    """SHA-256 of the statement of the head before in hexadecimal digits; empty in the first one."""
     made: str
     """UTC at which the head was made."""
     first: int
@@ -73,7 +73,7 @@ def digest_of_content(content: bytes) -> bytes:
 
 
 def _hashed(state: Any, content: bytes) -> bytes:
-    """Hash some kilobytes without releasing the interpreter's lock."""
+    """Add content to a hash, with Python's lock held if small; returns the digest."""
     view = memoryview(content)
     step = HELD_BYTES if len(content) <= LARGE_BYTES else len(content)
     for first in range(0, len(content), step):
@@ -190,7 +190,7 @@ RESULTS, REMOVED = "results", "results.removed"
 
 
 def key_of(table: Table, row: Row) -> str:
-    """Key that names a row in its facts."""
+    """Key that names a table's row in its facts: the values of its primary key."""
     return " ".join(str(row[column.name]) for column in table.primary_key)
 
 

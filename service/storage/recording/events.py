@@ -93,7 +93,7 @@ def add_event(
 
 @contextmanager
 def numbered(connection: Connection) -> Iterator[None]:
-    """Number the events of a transaction after everything else in it is done.
+    """Context manager that numbers a transaction's events at its end, and drops the oldest ones.
 
     The later the lock on the numbers is taken, the less other transactions wait for it.
     """
@@ -134,7 +134,7 @@ def last_event_about(connection: Connection, spacecraft: Collection[str]) -> int
 
 
 def events_after(connection: Connection, last: int, limit: int) -> Sequence[Event] | None:
-    """Events after a number, oldest first; None if some of them are no longer kept.
+    """Events after a number, oldest first; None if some are no longer kept, or it is unknown.
 
     None too for a number that was never assigned, which comes from another database.
     """

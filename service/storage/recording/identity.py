@@ -57,7 +57,7 @@ def identity_of(batch: ObservationBatch) -> Identity:
 
 @dataclass
 class Registry:
-    """Recorded results found for a set of identities and keys."""
+    """Recorded results by batch identity and by Idempotency-Key."""
 
     identities: dict[Identity, ExistingResult] = field(default_factory=dict)
     keys: dict[OwnKey, ExistingResult] = field(default_factory=dict)
@@ -65,7 +65,7 @@ class Registry:
     def holder(
         self, identity: Identity, key: OwnKey | None, fingerprint: str
     ) -> ExistingResult | KeyReused | Conflict | None:
-        """Find the recorded result with this body; None if new, an error if its name is taken.
+        """Find the recorded result with this body; None if new, an error if name or key is taken.
 
         The error is `KeyReused` where the key belongs to another body, which is checked first, and
         `Conflict` where the identity does.
@@ -86,7 +86,7 @@ class Registry:
         return by_identity
 
     def enter(self, identity: Identity, key: OwnKey | None, taken: ExistingResult) -> None:
-        """Note a new result for its identity and key, so that later submissions find it."""
+        """Note a new result under its identity and key, so that later submissions find it."""
         self.identities[identity] = taken
         if key is not None:
             self.keys[key] = taken
@@ -129,7 +129,7 @@ def _rows(connection: Connection, sql: str, wanted: Collection[object]) -> Seque
 def remember_keys(
     connection: Connection, keys: Sequence[tuple[Identity, OwnKey, ExistingResult]]
 ) -> list[AcquisitionError | None]:
-    """Assign keys to bodies recorded without one; an error for each key of another body."""
+    """Assign Idempotency-Keys to bodies recorded without one; an error or None for each."""
     outcomes: list[AcquisitionError | None] = []
     for identity, key, taken in keys:
         holder = look_up(connection, (), [key]).holder(identity, key, taken.fingerprint)
@@ -195,9 +195,9 @@ def _by_key(dialect: Dialect) -> str:
 
 BYTES = 8
 SETTINGS = (tables.missions, tables.catalogs, tables.mission_uses)
-"""Tables of settings, with a digest (`row_digest`) in each row."""
+"""Tables of mission settings and catalogs, whose rows each hold a digest (`row_digest`)."""
 _NO_CONTENT = ("results.current", "results.seq", "results.digest", "mission_uses.id")
-"""Columns left out of digests: the mark of the current result, places in an order, digests."""
+"""Columns that digests leave out: those that change, give an order, or hold a digest."""
 
 _encode = msgspec.json.Encoder().encode
 _in_order = itemgetter("tracker", "position")
@@ -260,7 +260,7 @@ def agrees(stored: int | None, digest: int) -> bool:
 
 @cache
 def _content(table: Table) -> Callable[[Row], dict[str, object]]:
-    """Build a function that converts a row to its content, the same from any database."""
+    """Build a function that extracts a table row's content, the same from any database."""
     columns = [
         (each.name, isinstance(each.type, Double))
         for each in table.columns

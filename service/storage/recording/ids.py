@@ -39,7 +39,7 @@ class Ulids:
 
 
 def following_ulid(id: str) -> str:
-    """Identifier that directly follows another one in order."""
+    """Identifier (ULID) that directly follows another one in order."""
     value = 0
     for letter in id:
         value = value << 5 | _ALPHABET.index(letter)
@@ -51,7 +51,7 @@ def _text_of(value: int) -> str:
 
 
 def derived_ulid(id: str, *of: str) -> str:
-    """Identifier of the same millisecond as another one; equal texts give an equal identifier."""
+    """Identifier (ULID) of the same millisecond as another one, derived from it and from texts."""
     digest = hashlib.sha256("\0".join((id, *of)).encode()).digest()
     value = int.from_bytes(digest[: _RANDOM_BITS // 8], "big")
     shifts = range(_RANDOM_BITS - 10, -1, -10)
@@ -59,7 +59,7 @@ def derived_ulid(id: str, *of: str) -> str:
 
 
 def unguessable_ulid() -> str:
-    """Generate an identifier that cannot be guessed from another one."""
+    """Generate an identifier (ULID) that cannot be guessed from another one."""
     return Ulids().new()
 
 

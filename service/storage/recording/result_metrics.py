@@ -71,7 +71,7 @@ _VALUES_OF = [QUANTITIES[name].value_of for name in tables.VALUES]
 
 
 def rolled_up(current: Sequence[Row]) -> Row:
-    """One row of a rollup from current results: counts, sums, least and greatest values."""
+    """Sums of current results as one row of a rollup: counts, sums, least and greatest values."""
     observed = [row["observed"] for row in current]
     status = [row["status"] for row in current]
     counts = (
@@ -187,7 +187,7 @@ def catalog_rows(answer: Answer, place: Mapping[str, int]) -> list[Integers]:
 
 
 def tracker_rows(batch_id: str, answer: Answer, stars: BatchStars) -> list[Row]:
-    """Rows of `tracker_values` for an answer, one for each tracker in its order."""
+    """Rows of `tracker_values` for an answer, one for each tracker in the mission's order."""
     expected = [_expected_squares(answer, each) for each in stars.corrected]
     scale = _scale(answer, expected)
     rows = []
@@ -228,7 +228,7 @@ def _status(answer: Answer, tracker: str) -> str | None:
 
 
 def _expected_squares(answer: Answer, seen: CorrectedObservations) -> Vector:
-    """Expected squared residual (n,) in arcsec^2 of each star.
+    """Expected squared residual in arcsec^2 of each star (n,); zeros without an attitude.
 
     For the best attitude it is the noise along both tangent axes, less the part that the attitude,
     of covariance P, absorbs: 2 sigma^2 - (trace P - d' P d).
@@ -242,7 +242,7 @@ def _expected_squares(answer: Answer, seen: CorrectedObservations) -> Vector:
 
 
 def _scale(answer: Answer, expected: Sequence[Vector]) -> float:
-    """Factor that scales the expected squared residuals to the sum that the answer predicts.
+    """Factor that scales the expected squared residuals to the sum that the answer predicts, or 0.
 
     It is 1 for QUEST. TRIAD's attitude absorbs a different part of the noise, which its answer
     gives for all stars together only.
@@ -259,7 +259,7 @@ def _scale(answer: Answer, expected: Sequence[Vector]) -> float:
 
 
 def _rms(squares: float, count: int) -> float | None:
-    """Root mean square from a sum of squares and a count; None if not known."""
+    """Root mean square from a sum of squares and a count; None if either is zero."""
     return math.sqrt(squares / count) if count and squares > 0.0 else None
 
 

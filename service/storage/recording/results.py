@@ -78,7 +78,7 @@ def register(connection: Connection, mission_rows: Sequence[Row], catalog_row: R
 
 
 def _trackers(settings: str) -> int:
-    """Number of trackers in a mission's settings."""
+    """Number of trackers in a mission's settings, given as JSON."""
     return len(json.loads(settings)["trackers"])
 
 
@@ -174,7 +174,7 @@ def _outdated(
 
 
 def last_good_results(connection: Connection, period: PredictedFrom) -> tuple[str, ...]:
-    """Ids of the two last good results of a period, latest first."""
+    """Ids of the two last good results in the period of a prediction's start, latest first."""
     asked = {name: getattr(period, name) for name in ("spacecraft", "run", "since_ns", "until_ns")}
     return tuple(row["id"] for row in _LAST_GOOD.read(connection, asked))
 
@@ -193,7 +193,7 @@ def _outcome(
 
 
 def _holder(unsaved: UnsavedResult, registry: Registry) -> ExistingResult | AcquisitionError:
-    """Find the result that holds an unsaved one's identity and key; enters it if none does."""
+    """Find the result with an unsaved one's identity and key, else itself; or a conflict error."""
     if unsaved.batch is None:
         return ExistingResult(unsaved.id, "")
     fingerprint = unsaved.batch["fingerprint"]
@@ -272,7 +272,7 @@ def _supersede(connection: Connection, unsaved: UnsavedResult) -> None:
 
 
 def next_seqs(connection: Connection, count: int) -> list[int]:
-    """Take the next `count` places in the record's order for results of this transaction.
+    """Take the next `count` places in the record's order, for results of this transaction.
 
     On PostgreSQL a transaction may commit after one with later places.  It has its number before it
     takes places: a reader that sees a later place, after all transactions of that moment have

@@ -1,4 +1,4 @@
-"""The author and the reason of a change, from the body of its request in the audit list."""
+"""Reading of a change's author and reason from its request's body, as kept in the audit list."""
 
 import json
 from contextlib import suppress
@@ -10,7 +10,7 @@ from service.contract.answers import Signature
 from service.storage.sql.tables import audit
 
 REASONS = ("comment", "note", "text")
-"""Fields of requests that give the reason of a change."""
+"""Names of the request fields that may give the reason of a change."""
 
 
 def signed_in(body: str | None) -> tuple[str | None, str | None]:

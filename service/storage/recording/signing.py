@@ -17,7 +17,7 @@ _BEGIN = "-----BEGIN"
 
 
 class Signer:
-    """Ed25519 private key that signs: a PEM file that only its owner may read, or the PEM text."""
+    """Signer with an Ed25519 private key, from a private PEM file or from PEM text."""
 
     def __init__(self, key: str) -> None:
         """Load the private key; raises `BadConfiguration`, or `NotAvailable` without the extra."""

@@ -25,13 +25,13 @@ from service.times import Utc
 from service.trends.measures import MeasuredStars
 
 AHEAD_NS = 3600 * 10**9
-"""Nanoseconds: a live batch dated further in the future is never shown as the latest."""
+"""Limit in nanoseconds: a live batch dated further in the future is never shown as the latest."""
 STARS = ("observed", "unique", "ambiguous", "unmatched")
-"""Names of the counts of a result's stars, by outcome."""
+"""Names of the four counts of a result's stars: all, and by outcome."""
 
 _RECORD = b'"record":'
 _NOT_RECORDED = _RECORD + b"null"
-"""JSON of `timings_us` before recording; unique, since quotes in a client's text are escaped."""
+"""JSON text at which a stored answer gets the time that recording took."""
 
 
 class Answered(Struct, frozen=True):
@@ -44,7 +44,7 @@ class Answered(Struct, frozen=True):
 
 
 class PredictedFrom(Struct, frozen=True):
-    """Results from whose attitudes a prediction starts: the last good ones of a period."""
+    """Period before a prediction and its last good results, from which the prediction starts."""
 
     spacecraft: str
     run: str
@@ -70,13 +70,13 @@ class UnsavedResult(Struct, eq=False):
     key: tuple[str, str] | None
     frame: Row | None = None
     handed_over_ns: int | None = None
-    """Time when the writer got the result (`time.perf_counter_ns`)."""
+    """Time of `time.perf_counter_ns` when the result was handed to the writer."""
     trackers: Sequence[Row] = ()
     """Rows of `tracker_values`, one for each tracker of a mission with several."""
     audit: Row | None = None
     """Audit entry that is stored with a recorded what-if."""
     predicted_from: "PredictedFrom | None" = None
-    """Results that a prediction started from, given if other services record attitudes as well."""
+    """Results that a prediction started from, if other services record attitudes too."""
 
     @property
     def id(self) -> str:

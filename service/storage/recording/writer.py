@@ -53,7 +53,7 @@ class Crossed(Busy):
 
 @dataclass(frozen=True)
 class WriterState:
-    """State of the writer: waiting records, age of the oldest in seconds, and failures."""
+    """State of the writer: number of waiting records, age of the oldest in seconds, failures."""
 
     queued: int
     oldest_s: float
@@ -65,7 +65,7 @@ class WriterState:
 
 @dataclass(eq=False, frozen=True)
 class _Ticket:
-    """Place of a thread in the queue for the writer, with the number of its records."""
+    """Ticket of a thread in the queue for the writer, with the number of its records."""
 
     records: int
     low_priority: bool
@@ -88,7 +88,7 @@ class _Turns:
 
     @contextmanager
     def turn(self, ticket: _Ticket, wait_s: float | None) -> Iterator[None]:
-        """Wait for the ticket's turn, which lasts as long as the `with` block.
+        """Context manager that waits for a ticket's turn to write, and holds it during the block.
 
         Raises `Busy` after `wait_s`, and `Stopping` after a call of `close`.
         """
@@ -189,7 +189,7 @@ class Writer:
         return outcomes
 
     def change(self, change: Callable[[Connection], T], *, of_posts: bool = False) -> T:
-        """Make a change in one transaction; after a conflict `change` is called again.
+        """Make a change in one transaction; returns its result. After a conflict it is repeated.
 
         Changes of posts wait no longer for their turn than results do; raises `Busy` after that.
         """
@@ -203,7 +203,7 @@ class Writer:
 
     @contextmanager
     def projection(self) -> Iterator[Connection]:
-        """Run a transaction of the projector, which lets other callers go first.
+        """Context manager of a transaction of the projector, which lets other writers go first.
 
         Raises `NotProjecting` where another service that shares the database projects.
         """
@@ -215,14 +215,14 @@ class Writer:
             yield connection
 
     def take_lock(self) -> Attempt:
-        """Take the projector's lock, if no other session has it; raises `Busy`."""
+        """Try to take the projector's lock; returns whether it was taken, refused or had before."""
         if self._lock is None:
             return "kept"
         with self._transaction(low_priority=True, is_projection=True) as connection:
             return self._lock.take(connection)
 
     def later(self, write: Callable[[], T]) -> "Future[T]":
-        """Call a writing function in a background thread, after those of earlier calls.
+        """Call a writing function in a background thread, after earlier ones; returns its future.
 
         Meanwhile the caller can compute the next results.
         """
@@ -268,7 +268,7 @@ class Writer:
         self._connection.close()
 
     def _attempted(self, write: Callable[[bool], T], records: int) -> T:
-        """Call a writing function, again after an error that another process may have caused.
+        """Call a writing function; repeat it after a crossed transaction, once after another error.
 
         `write` gets True if an attempt has failed before, so that care is needed.
         """
@@ -294,7 +294,7 @@ class Writer:
         wait_s: float | None = None,
         is_projection: bool = False,
     ) -> Iterator[Connection]:
-        """Run a transaction in this thread's turn, committed at the end of the `with` block.
+        """Context manager of a transaction in this thread's turn, committed after the block.
 
         An error raised by the block rolls the transaction back.  Raises `Busy` where the database
         fails or the turn does not come within `wait_s`, and `Crossed` where PostgreSQL stopped the
@@ -362,7 +362,7 @@ def _record(connection: Connection, unsaved_results: Sequence[UnsavedResult]) ->
 
 @contextmanager
 def _savepoint(connection: Connection) -> Iterator[None]:
-    """Keep the changes of a `with` block whole, or none of them.
+    """Context manager that undoes the changes of its block in a transaction if the block fails.
 
     A fault of the database itself ends the whole transaction: SQLite, its disk full, may have
     rolled it back already, and earlier changes would be lost.
@@ -381,7 +381,7 @@ def _savepoint(connection: Connection) -> Iterator[None]:
 
 
 def is_of_the_database(error: BaseException) -> bool:
-    """True if an error concerns the database, its disk or its connection, and not a single row."""
+    """True if a database error's class blames the database or connection, not a row or the SQL."""
     about_a_row = (exc.IntegrityError, exc.DataError, exc.ProgrammingError)
     return isinstance(error, exc.DBAPIError) and not isinstance(error, about_a_row)
 

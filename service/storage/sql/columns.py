@@ -25,20 +25,20 @@ HAS_FIRST_ROW = "has_first_row"
 """Key in a table's `info`: the table has a row in a new database."""
 
 BOUND = "bound"
-"""Key in the `info` of a feature's table: its `Bound`, or why its rows are not chained."""
+"""Key in the `info` of a feature's table: its `Bound`, or why no chain covers its rows."""
 
 
 class Bound(msgspec.Struct, frozen=True):
-    """How the rows of a table are facts of the record's chain."""
+    """Rules by which the rows of a table become facts of the record's chain."""
 
     free: frozenset[str] = frozenset()
-    """Columns left out of the chain's facts, because the service changes them."""
+    """Columns of a table that no fact covers, because the service changes them."""
     closed_by: str | None = None
-    """Column that is set once to close a row; a further fact then covers all columns but `free`."""
+    """Column that is set once to close a row, which adds a fact over all columns but `free`."""
     open_free: frozenset[str] = frozenset()
-    """Columns that may change until a row is closed."""
+    """Columns of a table that may change until a row is closed, and are covered only then."""
     rises: bool = True
-    """True if the keys of new rows are greater than those of older rows."""
+    """True if the keys of a table's new rows are greater than those of older rows."""
 
 
 Id = String(26)
@@ -49,7 +49,7 @@ Moment = String(30)
 
 
 def rows_where(sqlite: str, postgresql: str = "") -> dict[str, Any]:
-    """The arguments of an index of some rows only, by the condition that both dialects have.
+    """Keyword arguments for an index of only the rows that meet a condition, for both databases.
 
     SQLite uses such an index only where the query repeats its words.
     """

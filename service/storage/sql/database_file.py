@@ -20,7 +20,7 @@ FileIdentity = tuple[int, int]
 
 RETRY_S = 5
 PRIVATE_FILE, PRIVATE_FOLDER = 0o600, 0o700
-"""Access modes of files and folders with secrets: of webhooks, digests of tokens, telemetry."""
+"""Access modes of files and of folders that hold secrets, such as digests of tokens."""
 
 log = logging.getLogger(__name__)
 
@@ -49,7 +49,7 @@ class DatabaseFile:
 
     @property
     def is_read_only(self) -> bool:
-        """True if this process cannot write to the file, or create SQLite's log beside it."""
+        """True for an existing file that the process cannot write, or not its log beside it."""
         exists = self.path.exists()
         return exists and not (
             os.access(self.path, os.W_OK) and os.access(self.path.parent, os.W_OK)
@@ -76,7 +76,7 @@ class DatabaseFile:
             raise BadConfiguration(f"ACQUIRE_DATABASE: {self.path}: there is no such file")
 
     def require(self) -> None:
-        """Raise `Busy` unless the path still leads to the file that was opened."""
+        """Raise `Busy` if the path no longer leads to the file that was noted."""
         if self.identity is None or _identity(self.path) == self.identity:
             self._is_loss_logged = False
             return
@@ -193,7 +193,7 @@ class FileLock:
 
 @contextmanager
 def writing_alone(file: DatabaseFile | None) -> Iterator[None]:
-    """Hold the lock of a SQLite file during changes without a `Store`; None: a database server."""
+    """Context manager that holds a SQLite file's lock, without a `Store`; None: no lock."""
     if file is None:
         yield
         return
@@ -206,7 +206,7 @@ def writing_alone(file: DatabaseFile | None) -> Iterator[None]:
 
 
 def is_written(file: DatabaseFile) -> bool:
-    """True if another process holds the lock of an existing file, which must not be open here."""
+    """True if the lock of an existing SQLite file cannot be taken: held elsewhere, or read-only."""
     file.require_there()
     try:
         with writing_alone(file):

@@ -10,7 +10,7 @@ from service.storage.sql.columns import CURRENT, Digest, Id, Moment, Name, RunNa
 from service.storage.sql.tables import runs
 
 INNOVATIONS = "innovations"
-"""Stored in place of a grade for a block of measurements, with their innovations in the filter."""
+"""Stored word in place of an attitude's grade, for blocks of innovations of the filter."""
 
 graded_days = sa.Table(
     "graded_days",

@@ -20,9 +20,9 @@ class Dialect(ABC):
     """SQL fragments and small actions that differ between kinds of database."""
 
     is_shared: bool
-    """True if several services may work on one database at once."""
+    """True for a database on which several services may work at once."""
     module: ModuleType
-    """SQLAlchemy module of the dialect, whose `insert` handles conflicts."""
+    """SQLAlchemy module of the database's dialect, whose `insert` handles conflicts."""
     paramstyle: str
     wanted: str
     """SQL source `w` with one row for each element of the JSON array `wanted`."""
@@ -33,11 +33,11 @@ class Dialect(ABC):
 
     @abstractmethod
     def item(self, place: int) -> str:
-        """SQL for one text of an array, by its place; the array is an element of `wanted`."""
+        """SQL text for one item of an array, by its place; the array is an element of `wanted`."""
 
     @abstractmethod
     def wake_listeners(self, connection: Connection, channel: str) -> None:
-        """Notify the other services on the database when the transaction commits."""
+        """Notify the other services on the database, as soon as the transaction commits."""
 
     @abstractmethod
     def lock_table(self, connection: Connection, table: str) -> None:
@@ -53,7 +53,7 @@ class Dialect(ABC):
 
     @abstractmethod
     def remove_probe(self, connection: Connection) -> None:
-        """Remove the trial write, including one left by a process that was killed."""
+        """Remove the rows of a trial write, including one left by a process that was killed."""
 
 
 class _Sqlite(Dialect):
@@ -126,11 +126,11 @@ class _Postgresql(Dialect):
         )
 
     def remove_probe(self, connection: Connection) -> None:
-        """Do nothing: the trial wrote to PostgreSQL's log only."""
+        """Do nothing: a trial write on PostgreSQL leaves no rows."""
 
 
 def next_transaction(connection: Connection) -> int:
-    """Number of the next transaction, on a shared database."""
+    """Number of the first transaction not begun yet, on a database that several services share."""
     return _snapshot(connection, "xmax")
 
 

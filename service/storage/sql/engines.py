@@ -82,7 +82,7 @@ class PersistentConnection:
         file: DatabaseFile | None = None,
         turn_s: float | None = None,
     ) -> None:
-        """Prepare a connection; `begin` is SQLite's statement that begins a transaction.
+        """Prepare a connection without opening it; `begin` is SQLite's statement for a transaction.
 
         `file` must stay the same.  A caller that waits longer than `turn_s` for its turn gets
         `Busy`.
@@ -98,7 +98,7 @@ class PersistentConnection:
 
     @contextmanager
     def transaction(self) -> Iterator[Connection]:
-        """Run a transaction that commits at the end; an error closes the connection.
+        """Context manager of a transaction that commits at the end; an error closes the connection.
 
         `RolledBack` is no such error: the connection stays open.
         """
@@ -200,7 +200,7 @@ RV = TypeVar("RV")
 
 BUSY_TIMEOUT_MS = 10_000
 WRITER_CACHE_KIB = 32_768
-"""Page cache of the writing connection in KiB: each batch reads the inner pages of every index."""
+"""Size in KiB of the writing connection's page cache, for the inner pages of every index."""
 TO_WRITE, TO_READ = "BEGIN IMMEDIATE", "BEGIN"
 """SQLite statements that begin a transaction of the writing connection, and of a reader."""
 MAX_READERS = 16
@@ -213,7 +213,7 @@ and its reader a page of answers.
 
 @dataclass(frozen=True)
 class Timeouts:
-    """Database timeouts while a client waits for an answer.
+    """Database timeouts in seconds that hold while a client waits for an answer.
 
     `lock_s` bounds the wait for a lock, `statement_s` a statement; the server's reply to a
     statement may take `MORE_S` longer.
@@ -397,7 +397,7 @@ def _bounded(url: URL, timeouts: Timeouts, pool: dict[str, Any]) -> Engine:
 
 
 def _open_as_file(engine: Engine, file: DatabaseFile | None = None, create: bool = False) -> None:
-    """Let SQLite create its file with the first connection only, and only where allowed."""
+    """Make an engine open SQLite files by URI, creating a missing file at most once if `create`."""
     may_create = create
 
     @event.listens_for(engine, "do_connect")
@@ -444,7 +444,7 @@ def _set_up_sqlite(
 
 @contextmanager
 def patience(connection: Connection) -> Iterator[None]:
-    """Extend the timeouts of a transaction's statements beyond those of a post."""
+    """Context manager that extends the timeouts of a transaction beyond those of a post."""
     driver: Any = connection.connection.driver_connection
     answer_s = getattr(driver, "answer_s", None)
     if answer_s is None:

@@ -80,7 +80,7 @@ def require_records(database: str) -> None:
 
 
 def revision_of(database: str) -> str | None:
-    """Revision of a database's schema; None where it holds no records of the service."""
+    """Revision of a database's schema; None for a database without the service's schema."""
     with reading(database) as connection:
         return revision_in(connection)
 
@@ -108,7 +108,7 @@ def check(database: str) -> list[str]:
 
 
 def unknown_tables(database: str) -> list[str]:
-    """The tables of a database that no installed code knows, such as those of a feature removed."""
+    """Names of a database's tables that no installed code knows, as of a removed feature."""
     with reading(database) as connection:
         return _unknown_tables(connection)
 
@@ -219,7 +219,7 @@ def _config() -> "Config":
 
 
 def revision_in(connection: Connection) -> str | None:
-    """Schema revision of a connection's database; None where it holds no records of the service."""
+    """Schema revision of a connection's database; None without the service's schema."""
     if not inspect(connection).has_table("alembic_version"):
         return None
     revisions = connection.exec_driver_sql("SELECT version_num FROM alembic_version").scalars()
@@ -258,7 +258,7 @@ def _missing(connection: Connection) -> list[Table]:
 
 
 def _writer(connection: Connection) -> str:
-    """Service version that wrote the newest answer, if another schema still lets it be read."""
+    """Clause for a message: the service version of the newest answer, or that none tells it."""
     newest = "SELECT answer FROM results ORDER BY id DESC LIMIT 1"
     with suppress(SQLAlchemyError, ValueError, LookupError, TypeError), connection.begin_nested():
         answer = unpack(connection.exec_driver_sql(newest).scalar_one())
@@ -268,7 +268,7 @@ def _writer(connection: Connection) -> str:
 
 
 def _in_words(difference: Any) -> str:
-    """Describe one of alembic's differences: a verb, then its subject; or a list of these."""
+    """Text for one of alembic's differences (a verb, then its subject), or for a list of them."""
     if isinstance(difference, list):
         return "; ".join(_in_words(each) for each in difference)
     verb, *about = difference

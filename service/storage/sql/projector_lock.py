@@ -30,15 +30,15 @@ Attempt = Literal["kept", "taken", "refused"]
 
 
 class NotProjecting(Busy):
-    """Error for work that only one service on a database does, while another service does it."""
+    """Error for work that only one service on a database does, raised in the others."""
 
 
 class ProjectorLock:
-    """State of the projector's lock in the session that writes; used by the writer's thread."""
+    """Projector's lock of a shared database, held by the writer's session; for its thread."""
 
     def __init__(self) -> None:
         self._session: object | None = None
-        """The driver's connection that holds the lock; None without the lock."""
+        """Database session that holds the projector's lock; None without the lock."""
         self.lost = threading.Event()
         """Event set when a transaction finds that its session does not hold the lock."""
         self.at_work: set[str] = set()
@@ -88,7 +88,7 @@ class ProjectorLock:
 
 
 def left_behind(connection: Connection, ids: Collection[str]) -> set[str]:
-    """Replays and calibrations, out of `ids`, that no session holds a lock for."""
+    """Ids of the replays and calibrations, out of `ids`, that no session holds a lock for."""
     return {id for id in ids if execute(connection, _IS_FREE, {"id": id})[0][0]}
 
 

@@ -31,12 +31,12 @@ class Prepared:
     """Statement compiled to the same SQL text whatever its values."""
 
     def __init__(self, make: Callable[[Any], sa.Executable]) -> None:
-        """`make` builds the statement from a dialect's module, whose `insert` handles conflicts."""
+        """Prepare a statement; `make` builds it from the SQLAlchemy module of a dialect."""
         self._make = make
         self._ready: dict[Dialect, tuple[str, tuple[str, ...]]] = {}
         self._of_many: dict[int, str] = {}
         self._constants: Row = {}
-        """Values that are part of the statement itself."""
+        """Values by name that the statement itself fixes."""
 
     def run(self, connection: sa.Connection, rows: Sequence[Row]) -> None:
         """Run the statement once for each row of named values."""
@@ -85,7 +85,7 @@ class Prepared:
         return many
 
     def read(self, connection: sa.Connection, values: Row) -> list[Row]:
-        """Run the statement as a query; its rows by column name."""
+        """Run the statement as a query; returns its rows by column name."""
         dialect = dialect_of(connection)
         sql, names = self._sql(dialect)
         values = self._constants | values
@@ -98,7 +98,7 @@ class Prepared:
             return [dict(zip(_names(cursor), row, strict=True)) for row in rows]
 
     def _sql(self, dialect: Dialect) -> tuple[str, tuple[str, ...]]:
-        """SQL text for a dialect, and the names of its values by position."""
+        """SQL text for a dialect, and the names of its parameters by position."""
         ready = self._ready.get(dialect)
         if ready is None:
             module: Any = dialect.module
@@ -239,7 +239,7 @@ def _copy(connection: sa.Connection, table: sa.Table, rows: Sequence[Row]) -> No
 
 @cache
 def _copy_of(table: sa.Table) -> tuple[str, list[str]]:
-    """COPY statement for a table, and the PostgreSQL types of its binary columns."""
+    """COPY statement for a table, and the PostgreSQL types of its columns in binary form."""
     names = ", ".join(f'"{column.name}"' for column in table.columns)
     types = [
         next(name for kind, name in _COPIED if isinstance(column.type, kind))

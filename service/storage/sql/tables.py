@@ -88,7 +88,7 @@ audit = sa.Table(
 COUNTS = ("batches", "observed", "unique", "ambiguous", "unmatched", "solved", "suspect")
 _ROLLED_UP = {name: source for name, source in STORED.items() if source.rolled_up}
 SHARES = tuple(name for name, source in _ROLLED_UP.items() if isinstance(source, StarShare))
-"""Columns with shares of a batch's stars; their means follow from the counts."""
+"""Rollup columns of shares of a batch's stars, whose means follow from the counts."""
 VALUES = tuple(name for name in _ROLLED_UP if name not in SHARES)
 SUMS = tuple(f"{name}_{part}" for name in VALUES for part in ("n", "sum"))
 MINIMA = tuple(f"{name}_min" for name in (*SHARES, *VALUES))
@@ -252,9 +252,9 @@ frames = sa.Table(
 MEASURED = tuple(
     name for name, source in STORED.items() if isinstance(source, Measured | MeasuredOfBatch)
 )
-"""Columns of measured quantities in the table of results."""
+"""Names of the measured quantities that are columns in the table of results."""
 COUNTED = ("observed", "unique", "ambiguous", "unmatched")
-"""Columns that count stars by outcome."""
+"""Names of the columns that count stars by outcome."""
 _FILTERS = ("status", "unique", "ambiguous", "unmatched")
 
 results = sa.Table(

@@ -163,7 +163,7 @@ def _chosen(connection: Connection, day: _Day, before: Utc) -> list[ColumnElemen
 def newest_hours(
     connection: Connection, spacecraft: str, run: str, until: int | None = None
 ) -> Iterator[tuple[int, int]]:
-    """Bounds in ns of TAI of the hours of a run's newest batch and of its newest attitude.
+    """Bounds in ns of TAI of the hours with a run's newest batch and with its newest attitude.
 
     Hours after `until` are left out.
     """
@@ -307,7 +307,7 @@ def _by_hour(day: _Day, rows: Rows) -> dict[int, list[str]]:
 
 
 def hours_of(day: int, times_ns: Integers) -> list[int]:
-    """Hour numbers of a day's batches (n,), as `Utc.bucket` gives them, from times in ns of TAI."""
+    """Hour numbers (n,) of one day's batches, as `Utc.bucket` gives, from times in ns of TAI."""
     hours = range(24 * day, 24 * day + 24)
     starts_ns = np.array([bucket_start(hour, HOUR_S).tai_ns for hour in hours])
     # A leap second belongs to the hour that it ends.
@@ -316,7 +316,7 @@ def hours_of(day: int, times_ns: Integers) -> list[int]:
 
 
 def _discard_unfinished(store: Store, folder: Path, day: _Day) -> None:
-    """Delete archive files of a day whose batches stayed in the record.
+    """Delete a day's archive files whose batches are all still in the record.
 
     Files of other databases, which have none of these batches, stay.
     """
@@ -344,7 +344,7 @@ def _discard_unfinished(store: Store, folder: Path, day: _Day) -> None:
 
 @dataclass(frozen=True)
 class PartFilter:
-    """Filter for archive parts of a spacecraft and run with a time from `start` to before `end`."""
+    """Filter for archive parts by spacecraft, run and period; None selects all."""
 
     spacecraft: str | None = None
     run: str | None = None
@@ -450,7 +450,7 @@ def forget_part(
 
 
 def _placed(rows: Rows, position: int) -> Rows:
-    """Keep the rows' places in the record up to `position`; reset later places to none.
+    """Rows of results without their places in the record after `position`.
 
     The projector passes over the kept places: their part in the trends is there, or added here.
     """

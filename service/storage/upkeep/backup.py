@@ -67,7 +67,7 @@ def back_up(
 
 @contextmanager
 def _part_of(target: Path) -> Iterator[Path]:
-    """Provide a temporary file beside the target; it is deleted at the end."""
+    """Context manager of a temporary file beside the target, deleted at the end."""
     part = target.with_name(target.name + ".part")
     part.unlink(missing_ok=True)
     try:
@@ -80,7 +80,7 @@ def _part_of(target: Path) -> Iterator[Path]:
 
 
 def _move(part: Path, target: Path, move: Callable[[Path, Path], object]) -> None:
-    """Move a file to its final name, so that both survive a power cut."""
+    """Move a temporary file to its final name, so that content and name survive a power cut."""
     with part.open("rb") as file:
         os.fsync(file.fileno())
     move(part, target)
@@ -264,7 +264,7 @@ def _restore_postgresql(source: Path, url: URL) -> str:
 
 
 def _entry(line: str) -> str:
-    """Subject of a line in a backup's list: the end of `5; 2615 2200 SCHEMA - public me`."""
+    """Subject of an entry in a backup's list: the end of `5; 2615 2200 SCHEMA - public me`."""
     return " ".join(line.partition(";")[2].split(" ")[3:])
 
 

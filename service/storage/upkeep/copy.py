@@ -28,7 +28,7 @@ from service.storage.sql.statements import count, insert_all
 from service.storage.upkeep.verify import verify
 
 ROWS_AT_ONCE, LARGE_ROWS_AT_ONCE = 2_000, 20
-"""Rows in memory at a time; fewer for tables with packed samples and pictures (1 MB a row)."""
+"""Rows copied at a time, and fewer for tables with packed samples and pictures (1 MB a row)."""
 
 Step = Callable[[str, int, int], object]
 """Callback for the progress of a copy: the action, rows or batches done, and the total."""
@@ -57,7 +57,7 @@ def copy_record(
 
 @contextmanager
 def _source(database: str) -> Iterator[sa.Connection]:
-    """Connect to the source of a copy as of one moment, while no service writes to it."""
+    """Context manager of a connection to the source of a copy as of one moment, which locks it."""
     with _named("FROM"):
         migrations.require_records(database)
         url = engines.database_url(database)
@@ -74,7 +74,7 @@ def _source(database: str) -> Iterator[sa.Connection]:
 
 @contextmanager
 def _target(database: str) -> Iterator[sa.Connection]:
-    """Connect to the target of a copy for writing; it gets tables, and no service may use it."""
+    """Context manager of a connection to the target of a copy for writing, with its tables made."""
     with _named("TO"):
         url = engines.database_url(database)
     with (
@@ -93,7 +93,7 @@ def _target(database: str) -> Iterator[sa.Connection]:
 
 @contextmanager
 def _named(argument: str) -> Iterator[None]:
-    """Name a command's argument instead of the setting in error messages."""
+    """Context manager that names a command's argument instead of the setting in errors."""
     try:
         yield
     except BadConfiguration as error:
@@ -102,7 +102,7 @@ def _named(argument: str) -> Iterator[None]:
 
 
 def _take_lock(connection: sa.Connection) -> None:
-    """Take the projector's lock of a shared database until the session ends."""
+    """Take the projector's lock of a shared database until the session ends, or raise."""
     if not dialect_of(connection).is_shared:
         return
     if ProjectorLock().take(connection) != "taken":
@@ -150,7 +150,7 @@ def _counted(connection: sa.Connection, tables: Sequence[sa.Table]) -> Counts:
 
 
 def _begin(connection: sa.Connection, tables: Sequence[sa.Table], counts: Counts) -> bool:
-    """Mark a new database as an unfinished copy; False if the copy is complete already."""
+    """Mark an empty target of a copy as unfinished, unless marked; False if it has all rows."""
     marked = (
         migrations.UNFINISHED + blake2b(msgspec.json.encode(counts), digest_size=12).hexdigest()
     )
@@ -206,7 +206,7 @@ def _copy_rows(
 
 
 def _own_references(table: sa.Table) -> list[sa.Column[Any]]:
-    """Columns that refer to rows of the same table, which may be copied later."""
+    """Columns that refer to rows of their own table, which may be copied later."""
     return [key.parent for key in table.foreign_keys if key.column.table is table]
 
 

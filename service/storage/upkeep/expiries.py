@@ -22,7 +22,7 @@ _FIRST_YEAR = 2017
 
 
 class TokenTerm(Struct, frozen=True):
-    """Creation and expiry of a token in force, as UTC texts."""
+    """Access token in force, with its creation and expiry as UTC texts."""
 
     name: str
     created: str
@@ -48,7 +48,7 @@ class Expiries(Struct, frozen=True):
 
 @cache
 def leap_seconds_end() -> Utc:
-    """Start of the first year that ERFA calls dubious: over five years after its table was made.
+    """Start of the first year that ERFA calls dubious, over five years after its leap-second table.
 
     The International Earth Rotation Service announces a leap second half a year ahead in its
     Bulletin C, so the table can be out of date earlier; a newer `pyerfa` brings the newest.
@@ -63,7 +63,7 @@ def leap_seconds_end() -> Utc:
 
 @dataclass(frozen=True)
 class ExpiryDates:
-    """Reader of expiry dates, which warns of those that are near."""
+    """Reader of expiry dates: of the leap-second table and of tokens; it warns of near ones."""
 
     reading: Callable[[], AbstractContextManager[Connection]]
     now: Callable[[], Utc] = utc_now
@@ -81,7 +81,7 @@ class ExpiryDates:
         return Expiries(leap_seconds_end().text, tokens)
 
     def warn(self) -> list[str]:
-        """Log a warning for each expiry that is near or past."""
+        """Log and return a warning for each expiry that is near or past."""
         found, now = self.dates(), self.now()
         soon = shifted(now, SOON_DAYS * DAY_S).text
         warnings = []

@@ -56,7 +56,7 @@ class ForgetFilter:
         return not (self.batches or self.gyro_blocks)
 
     def of(self, table: Table, names: Collection[str] = (), name: str = "") -> list[Any]:
-        """SQL conditions for the selected rows of a table."""
+        """SQL conditions for the selected rows of a table: run, spacecraft and, if named, names."""
         chosen: list[ColumnElement[bool]] = [table.c.run == self.run]
         if self.spacecraft is not None:
             chosen.append(table.c.spacecraft == self.spacecraft)
@@ -253,7 +253,7 @@ def _forget_archived(store: Store, folder: Path, selected: ForgetFilter) -> int:
 
 
 def _forget_run(store: Store, run: str) -> None:
-    """Delete the settings of a run, unless data were recorded in it meanwhile."""
+    """Delete the row of a forgotten run, unless rows recorded meanwhile refer to it."""
     deletion = delete(runs).where(runs.c.name == run)
     with suppress(IntegrityError):
         store.writer.change(lambda connection: connection.execute(deletion))

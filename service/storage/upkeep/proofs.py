@@ -41,7 +41,7 @@ class Proof(msgspec.Struct, kw_only=True):
 
 
 def prove(connection: sa.Connection, id: str) -> Proof:
-    """Build the inclusion proof of a recorded result; raises `NotFound` if no head covers it."""
+    """Build the inclusion proof of a recorded result; raises `NotFound` if not in a head yet."""
     query = sa.select(results, record_leaves.c.leaf).join_from(
         results, record_leaves, results.c.seq == record_leaves.c.seq
     )
@@ -89,7 +89,7 @@ def read_proof(file: Path) -> Proof:
 def faults_of(
     proof: Proof, public_key: PublicKey | None = None, answer: bytes | None = None
 ) -> list[str]:
-    """Faults of a proof, one sentence each; empty if the head contains the result."""
+    """Sentences on each fault of a proof: its path, and the answer and public key if given."""
     found = []
     if answer is not None and hashlib.sha256(answer).hexdigest() != proof.answer_sha256:
         found.append("the answer is not the one that was recorded")

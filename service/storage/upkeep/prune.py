@@ -42,7 +42,7 @@ Conditions = list[ColumnElement[bool]]
 
 @dataclass
 class Pruned:
-    """Progress of pruning: batches, gyro blocks and definitive days to delete, and deleted."""
+    """Progress of pruning: numbers of batches, gyro blocks and attitude days, total and deleted."""
 
     total: int
     batches: int = 0
@@ -101,7 +101,7 @@ def prune(
 
 
 def _of_run(run: str | None, table: Table, chosen: ColumnElement[bool]) -> Conditions:
-    """Extend an SQL condition on a table to one run, or to all for None."""
+    """SQL conditions for a table's rows: the given one, and that of a run unless it is None."""
     return [chosen] if run is None else [chosen, table.c.run == run]
 
 

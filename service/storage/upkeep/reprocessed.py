@@ -33,13 +33,13 @@ from service.storage.upkeep.archiving import described, hours_of, newest_hours, 
 from service.times import DAY_S, bucket_start, parse_utc
 
 IDENTITY = ("id", "spacecraft", "run", "batch", "fingerprint")
-"""Columns of an archived batch that stay in the database."""
+"""Columns of an archived batch that stay in the database, to recognise it."""
 _LONG = ["answer", "options"]
 
 
 @dataclass(frozen=True)
 class RunPart:
-    """A written archive part of a reprocessed run, with the data for the database."""
+    """Archive part of a reprocessed run as written, with the data that the database keeps of it."""
 
     spacecraft: str
     day: str
@@ -47,9 +47,9 @@ class RunPart:
     identities: pa.Table
     """Table of the batches' identities, with the columns of `IDENTITY`."""
     shares: Mapping[int, Mapping[str, Row]]
-    """Rollups by hour, of each tracker and of the `WHOLE`."""
+    """Rollup rows by hour, and by tracker or `WHOLE`, that the database keeps of the part."""
     latest: Row
-    """The latest batch, in the form of an event."""
+    """Latest batch of the archive part, in the form of an event."""
 
 
 def run_part(name: str, source: str, rows: Rows, content: bytes) -> RunPart:
@@ -69,7 +69,7 @@ def run_part(name: str, source: str, rows: Rows, content: bytes) -> RunPart:
 
 
 def _latest(rows: Rows) -> Row:
-    """The latest batch of a part, chosen as `projections.projector` does."""
+    """Latest batch of an archive part in the form of an event, as the projector makes it."""
     batch = rows["batches"].slice(len(rows["batches"]) - 1).to_pylist()[0]
     (result,) = (
         rows["results"].filter(pc.equal(rows["results"]["batch_id"], batch["id"])).to_pylist()
@@ -96,7 +96,7 @@ def _shares(rows: Rows, day: int) -> dict[int, dict[str, Row]]:
 
 
 def name_part(folder: Path, made: RunPart) -> str:
-    """Name an archive part in the manifest of its day; returns its path below the folder."""
+    """Enter an archive part in the manifest of its day; returns its path below the folder."""
     manifest = manifest_of(folder, made.spacecraft, made.day).with_part(made.part)
     write_manifest(folder, manifest)
     return path_of(folder, manifest, made.part)
@@ -168,7 +168,7 @@ def _as_recorded(rows: Rows) -> Iterator[Sequence[RecordedResult]]:
 
 
 def unmerged(store: Store, folder: Path, run: str) -> Iterator[tuple[str, RunPart]]:
-    """Archive parts of a run that a manifest names but the database lacks, with their paths.
+    """Archive parts of a run that a manifest names but the database lacks, each after its path.
 
     A process that was killed between the two steps left them.  Raises `BadConfiguration` for a
     damaged part.

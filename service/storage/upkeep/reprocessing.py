@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 
 
 class Reprocessing(Struct, frozen=True, kw_only=True):
-    """Progress of a reprocessing into an archive at its last update."""
+    """Progress of one reprocessing into an archive, as last written."""
 
     run: str
     source: str
@@ -55,7 +55,7 @@ class Reprocessing(Struct, frozen=True, kw_only=True):
         return left / self.batches_per_s if self.batches_per_s > 0.0 else None
 
     def state(self, now: Utc) -> Literal["running", "done", "interrupted"]:
-        """State of a reprocessing at a time."""
+        """State of a reprocessing at a time: running, done, or interrupted if long silent."""
         if self.finished is not None:
             return "done"
         silent_s = (now.tai_ns - recorded_utc(self.updated).tai_ns) * 1e-9

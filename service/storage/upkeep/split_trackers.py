@@ -56,7 +56,7 @@ LOG_EVERY_S = 60.0
 Owner = tuple[str, str]
 """Key of a run to be split: spacecraft and run."""
 Place = tuple[int | None, str | None]
-"""`time_ns` and id of the batch examined last; None at the beginning."""
+"""Position of a batch in a run: its `time_ns` and id; None twice before the first."""
 
 
 @dataclass
@@ -120,7 +120,7 @@ class TrackerSplitter:
     def _catalog(
         self, answer: Answer, mission: Mission, time: str
     ) -> tuple[RunCatalog, Mapping[str, int]]:
-        """Run catalog of an answer, with indices by star id; none if the catalog changed."""
+        """Run catalog of an answer, and indices by star id: none if the catalog has changed."""
         digest = answer.provenance.run_catalog
         if digest not in self._catalogs:
             catalog = self.sky.run_catalog(mission, parse_utc(time))
@@ -202,7 +202,7 @@ def _in_steps(
 
 
 def _place(connection: Connection, owner: Owner, *, lock: bool = False) -> Place | None:
-    """Position up to which the batches of a run were examined; None if all are."""
+    """Position up to which the batches of a run were split by tracker; None if all are."""
     query = select(tracker_splits.c.time_ns, tracker_splits.c.batch_id).where(_is(owner))
     row = connection.execute(query.with_for_update() if lock else query).first()
     return None if row is None else (row[0], row[1])

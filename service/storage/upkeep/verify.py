@@ -104,7 +104,7 @@ def faults_in(
 
 
 def _read_any_text(connection: Any, _: object) -> None:
-    """Let SQLite's driver read damaged UTF-8 as other letters, so that the fault's row is named."""
+    """Let SQLite's driver decode damaged UTF-8 with replacements, so that faults name the row."""
     connection.text_factory = partial(str, encoding="utf-8", errors="replace")
 
 
@@ -155,7 +155,7 @@ def _of_the_batches(engine: sa.Engine, step: Step) -> Iterator[str]:
 def _pages(
     engine: sa.Engine, table: sa.Table, order: Sequence[str], at_once: int
 ) -> Iterator[tuple[sa.Connection, list[Row]]]:
-    """Read a table page by page in the order of unique columns, each page as of one moment."""
+    """Pages of a table's rows in the order of unique columns, each with its own connection."""
     columns = [table.c[name] for name in order]
     query = sa.select(table).order_by(*columns).limit(at_once)
     beyond = query

@@ -92,7 +92,7 @@ def faults_of_the_chain(
 
 
 def _statements(stored: Sequence[Row]) -> list[Statement]:
-    """Decode the statements of heads; unreadable ones are reported by `_of_the_heads`."""
+    """Decode the statements of heads, without unreadable ones, which `_of_the_heads` reports."""
     found = []
     for row in stored:
         try:
@@ -159,7 +159,7 @@ def _of_the_roots(connection: sa.Connection, statements: Sequence[Statement]) ->
 def bound_by(
     connection: sa.Connection, before: Statement, head: Statement
 ) -> tuple[list[tuple[int, bytes]], list[Row]]:
-    """Leaves and facts that a head covers."""
+    """Leaves with their places, and rows of facts, that a head covers beyond the one before."""
     place = record_leaves.c.seq
     query = sa.select(place, record_leaves.c.leaf)
     later = query.where(place > before.last, place <= head.last).order_by(place)
@@ -202,7 +202,7 @@ def _of_a_result(row: Row, content: bytes, last: Statement) -> Iterator[str]:
 
 
 def _leaves_of(row: Row, content: bytes) -> tuple[bytes, bytes]:
-    """Both possible leaves of a result: not current when recorded, and current."""
+    """Both leaves that a result can have: as not current when recorded, and as current."""
     later, at_once = (
         chain.leaf_of(row["id"], row["answer"], content, mark) for mark in (False, True)
     )
