@@ -33,7 +33,7 @@ def ranked(prefilter, beyond, prefiltered):  # type: ignore[no-untyped-def]
             prefilter.single[c, s] = prefilter.coefficients[k, c]
 
 
-@njit(nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy", forceinline=True)
 def pairs_of(pairs, place, at, count, rows_i, rows_j, chunk):  # type: ignore[no-untyped-def]
     """Load the next `count` star pairs into the prefilter; returns their number of candidates.
 
@@ -55,7 +55,7 @@ def pairs_of(pairs, place, at, count, rows_i, rows_j, chunk):  # type: ignore[no
     return candidates
 
 
-@njit(nogil=True)
+@njit(nogil=True, forceinline=True)
 def possible_of(bits, count, asked, prefilter, chunk):  # type: ignore[no-untyped-def]
     """The number of a chunk's candidates whose first predicted points may have a star.
 
@@ -86,7 +86,7 @@ def possible_of(bits, count, asked, prefilter, chunk):  # type: ignore[no-untype
     return left
 
 
-@njit(nogil=True)
+@njit(nogil=True, forceinline=True)
 def stars_near(bits, prefilter, plan, place_a, place_b):  # type: ignore[no-untyped-def]
     """Mask, by rank, of points that may have a star if i and j are two given stars; 0 if too few.
 

@@ -69,7 +69,7 @@ def _single_cell(x, y, z):  # type: ignore[no-untyped-def]
     return cu * np.int32(CELLS) + cv
 
 
-@njit(nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy", forceinline=True)
 def cells_of_pairs(count, alpha, beta, gamma, pair, cell):  # type: ignore[no-untyped-def]
     """The cells (2, count) of one point's predicted places for many star pairs, in both orders.
 
@@ -91,7 +91,7 @@ def cells_of_pairs(count, alpha, beta, gamma, pair, cell):  # type: ignore[no-un
         )
 
 
-@njit(nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy", forceinline=True)
 def cells_of_points(count, coefficients, x, y, cell):  # type: ignore[no-untyped-def]
     """Cells (count) of many points' predicted places, coefficients (3, count), for one pair."""
     x0, x1, x2, y0, y1, y2 = x[0], x[1], x[2], y[0], y[1], y[2]
