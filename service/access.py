@@ -378,7 +378,7 @@ class Access:
     def __init__(
         self, reading: Reading, change: RunInTransaction, loopback: bool, now: Now
     ) -> None:
-        """`reading` gives a connection; `change` runs a change and waits for its commit.
+        """Prepare access control; `reading` gives a connection, `change` runs and commits a change.
 
         `loopback` is True if the service listens on a loopback address only.
         """

@@ -69,7 +69,7 @@ def steps_between(
     first_rate: Vector | None = None,
     second_rate: Vector | None = None,
 ) -> Steps:
-    """Build the steps between attitudes (n, 4) and others (n, 4) that are `step_s` (n,) later.
+    """Prepare interpolation between attitudes (n, 4) and others (n, 4), `step_s` (n,) later.
 
     Rates (n, 3) are of the body relative to inertial, in body axes, rad/s; NaN where unknown.
     Where only one of both is known, it is used for the whole step.

@@ -75,7 +75,7 @@ def configure(settings: LogSettings, process: str, stream: TextIO | None = None)
 
 
 def finish() -> None:
-    """Write the pending counts: a process ended by a signal does not close its log."""
+    """Write the pending counts of repeated errors, as a signal ends a process without it."""
     for handler in logging.getLogger().handlers:
         if isinstance(handler, CountingHandler):
             handler.write_counts()

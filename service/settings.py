@@ -143,7 +143,7 @@ class Settings:
 
     @property
     def ships_missions(self) -> bool:
-        """True if the missions of the package are available."""
+        """True if the missions that are shipped with the service are available."""
         return self.shipped_missions == "on"
 
     @property

@@ -95,7 +95,7 @@ class CalibrationAdoptions:
         return self._in_force.files.get(spacecraft) or self._context.mission(spacecraft)
 
     def changed_files(self) -> dict[str, str]:
-        """Mission file changes for the next start, by spacecraft; raises `BadConfiguration`."""
+        """Sentence on each mission file that has changed or gone; raises `BadConfiguration`."""
         settings = self._context.settings
         now = load_missions(*settings.mission_places, shipped=settings.ships_missions)
         found = {}

@@ -68,7 +68,7 @@ class Context:
         return (*limited_trackers(self.mission(name)), *self.retired.trackers.get(name, ()))
 
     def has_feature(self, name: str) -> bool:
-        """True unless the settings switch a feature off."""
+        """True if a feature is installed and the settings do not switch it off."""
         return any(each.name == name for each in features_on(self.settings.features_off))
 
     def require_alarms(self, wanted: bool) -> None:

@@ -214,7 +214,7 @@ def _register(context: Context) -> None:
 
 
 def _end_left_work(app: App) -> None:
-    """Close replays left by an earlier process, if this is the only service on the database."""
+    """Mark replays of an ended process as waiting if their files are stored, else interrupted."""
     moment = utc_now().text
     stored = Spool(app.settings.spool_folder).ids()
     app.context.change(lambda connection: mark_interrupted(connection, moment, stored))

@@ -201,7 +201,7 @@ COMPARE_SAMPLE, COMPARE_RETRY_S = 100, 10
 
 @dataclass(frozen=True)
 class Stretch:
-    """Period whose batches are compared, at most `sample` of them."""
+    """Batches to compare: those of a spacecraft in a period, at most `sample` of them."""
 
     spacecraft: str
     run: str | None = None

@@ -124,7 +124,7 @@ class Service:
         log.info("ready for batches that need the whole sky; still compiling other kernels")
 
     def _prewarm_sky(self, missions: Iterable[Mission], time: Utc, whole_sky: bool = False) -> None:
-        """Build catalogs and zones of missions; for the whole sky if its kernels exist."""
+        """Build catalogs and zones of missions; for the whole sky if asked or its kernels exist."""
         whole_sky |= self._kernels is None or not self._kernels.whole_sky_needed
         for mission in missions:
             try:

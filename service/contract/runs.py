@@ -53,8 +53,9 @@ class Forgotten(Record, frozen=True, kw_only=True):
     archived_batches: Annotated[Count, doc("Batches in the archive.")]
     gyro_blocks: Count
     graded_days: Count
-    """Days of filtered and smoothed attitudes that were computed with the removed data, every
-        revision counted. `acquire smooth` computes them again from the remaining data."""
+    """Number of days of filtered and smoothed attitudes that were computed with the removed data,
+    every revision counted. `acquire smooth` computes them again from the remaining data.
+    """
 
 
 class ReplayLines(Record, frozen=True, kw_only=True):
@@ -71,7 +72,7 @@ class ReplayCounts(Record, frozen=True, kw_only=True):
     new: Annotated[Count, doc("Batches that this replay recorded.")]
     repeated: Annotated[Count, doc("Batches that were already recorded.")]
     observed: Count
-    """Observed stars of the replay's batches; the next fields count them by outcome."""
+    """Number of observed stars of the replay's batches; the next fields count them by outcome."""
     unique: Count
     ambiguous: Count
     unmatched: Count
@@ -89,7 +90,7 @@ class ApidPackets(Record, frozen=True, kw_only=True):
     gaps: Annotated[Count, doc("Places where the sequence count skips packets.")]
     missing: Annotated[Count, doc("Packets that are missing in these places.")]
     backward: Count
-    """Places where the sequence count repeats or goes back: after a reset, or in changed order."""
+    """Number of places where the sequence count repeats or goes back: a reset, or another order."""
     refused: Count
     incomplete: Annotated[Count, doc("Segments of packets of which others are missing.")] = 0
 
@@ -112,12 +113,12 @@ class ReplayPackets(Record, frozen=True, kw_only=True):
     refused: Annotated[Count, doc("Packets that could not be read.")]
     joined: Annotated[Count, doc("Packets that were joined of segments.")] = 0
     incomplete: Count = 0
-    """Segments of incomplete packets; they are counted as refused as well."""
+    """Number of segments of incomplete packets; they are counted as refused as well."""
     unread_bytes: Count = 0
-    """Bytes from the first unreadable packet of each file to the end of the file."""
+    """Number of bytes from the first unreadable packet of each file to the end of the file."""
     empty_files: Annotated[Count, doc("Files without a packet.")] = 0
     without_attitude: Count = 0
-    """Packets whose a priori quaternion was zero or not finite."""
+    """Number of packets whose a priori quaternion was zero or not finite."""
     apids: Annotated[list[ApidPackets], doc("The hundred APIDs with the most packets.")]
 
 
@@ -258,7 +259,7 @@ class Comparison(Record, frozen=True, kw_only=True):
     b: ComparedSide
     transitions: list[Transition]
     renamed: Count
-    """Stars that are unique on both sides, but identified as different catalog stars."""
+    """Number of stars unique on both sides, but identified as different catalog stars."""
     attitudes: ComparedAttitudes
     changed_batches: Count
     changed: Annotated[list[BatchChange], doc("The first hundred, oldest first.")]
@@ -273,7 +274,7 @@ class OutcomeCounts(Struct, frozen=True, kw_only=True):
 
 
 class StatusCounts(Struct, frozen=True, kw_only=True):
-    """Batches by the status of their attitude."""
+    """Number of batches by the status of their attitude."""
 
     good: int = 0
     suspect: int = 0

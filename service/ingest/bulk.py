@@ -162,7 +162,7 @@ def solve_lines(solver: Solver, lines: TelemetryLines) -> list[LineResult]:
 INTERACTIVE_WINDOW_S = 0.5
 """Seconds that bulk work pauses after a single batch, because another may follow."""
 LINES, FEW_LINES = 64, 8
-"""Lines in a chunk, and fewer while single posts arrive, which wait for up to one chunk."""
+"""Number of lines in a chunk, and a smaller one while single posts arrive, which wait for it."""
 
 
 class Bulk:

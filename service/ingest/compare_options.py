@@ -192,7 +192,7 @@ _WHICH = {
 def compare(
     pairs: Sequence[Pair], run_again: tuple[RunManyAgain, RunManyAgain], limit_s: float
 ) -> tuple[ComparisonTally, bool]:
-    """Run a sample of batches with both sets of options; True as well if time ran out.
+    """Run a sample of batches with both sets of options; also tells if the time ran out.
 
     `limit_s` bounds the time in seconds.  Many batches are solved at once, but singly while each
     may take seconds.

@@ -109,7 +109,7 @@ class LocalWorkers(Generic[Input, Output]):
     """Pool of worker processes for one kind of work, from the first `start` to `close`."""
 
     def __init__(self, config: WorkerConfig, work: "Work[Input, Output]", count: int) -> None:
-        """`work` must be a function of a module, so that a worker finds it by its name."""
+        """Prepare a pool without processes; a worker finds the function `work` by its name."""
         self._config, self._work, self.count = config, work, count
         self._lock = threading.Lock()
         self._workers: list[_Worker] = []
@@ -180,7 +180,7 @@ class LocalWorkers(Generic[Input, Output]):
     # ---- with the lock held ------------------------------------------------------------------
 
     def _wake_thread(self) -> None:
-        """Wake the supervising thread; starts it, unless there is nothing to do."""
+        """Wake the supervising thread, or start it if there is work for it."""
         if self._wake is not None:
             if not self._is_woken:
                 self._is_woken = True
@@ -214,7 +214,7 @@ class LocalWorkers(Generic[Input, Output]):
             self._waiting.popleft().fail(WorkerLost(reason))
 
     def _pause(self) -> None:
-        """Delay the next start of processes, unless a chunk needs them."""
+        """Delay starts of processes, unless chunks wait and none runs; each delay is doubled."""
         self._not_before_s = time.monotonic() + self._pause_s
         self._pause_s = min(2.0 * self._pause_s, LONGEST_PAUSE_S)
 

@@ -45,7 +45,7 @@ class MissionsInForce:
         self._when_changed.append(call)
 
     def follow(self) -> None:
-        """Load the adopted calibrations again if another service has adopted one since."""
+        """Load the adopted calibrations again if the newest adoption is another one than loaded."""
         with self._readers.reading_record() as connection:
             self.follow_in(connection)
 

@@ -58,7 +58,7 @@ class Source:
     digest: str
     """SHA-256 of the source file."""
     path: str | None
-    """Below the folder; None: the content is here."""
+    """Path of the source file within the archive; None: `content` holds the file."""
     content: bytes = b""
 
     def read(self, folder: Path) -> bytes:
@@ -113,7 +113,7 @@ class PartitionResult:
 
 
 def process_partition(solver: Solver, task: PartitionTask) -> list[PartitionResult]:
-    """Run a task, and write its file unless it exists."""
+    """Run a task, and write its archive part unless that exists or no batch has a result."""
     found: list[UnsavedResult] = []
     refused: list[RefusedBatch] = []
     stored = [row for row in _stored(task) if row["batch"] not in task.left_out]
@@ -258,7 +258,7 @@ class OwnProcess:
         return lambda seconds: result_of(attempt(self._solver, task)[0])
 
     def close(self) -> None:
-        """Do nothing: there are no processes to end."""
+        """Do nothing on closing: there are no processes to end."""
 
 
 class LocalProcesses:

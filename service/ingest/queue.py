@@ -299,7 +299,7 @@ class IngestQueue:
         }
 
     def _begins(self, pending: PendingBatch) -> bool:
-        """True for a batch to compute now; others go to the pool, or wait for an equal batch."""
+        """True for a batch to compute now; others go to the pool, or wait for a batch before."""
         with self._changed:
             repeats = self._in_flight.get(pending.identity)
             if repeats is not None:
@@ -499,7 +499,7 @@ class Sequences(Generic[T]):
         self._numbers = count()
 
     def enter(self, key: Hashable, time_ns: int, item: T) -> bool:
-        """Start an item of a sequence if none is active; otherwise queue it and return False."""
+        """True if the item may start, as none of its sequence does; otherwise it is queued."""
         waiting = self._waiting.get(key)
         if waiting is None:
             self._waiting[key] = []
@@ -508,7 +508,7 @@ class Sequences(Generic[T]):
         return False
 
     def leave(self, key: Hashable) -> T | None:
-        """Next waiting item of a sequence whose active one is done; None if none waits."""
+        """End the active item of a sequence; returns the next waiting item, or None."""
         waiting = self._waiting[key]
         if waiting:
             return heapq.heappop(waiting)[2]

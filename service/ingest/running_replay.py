@@ -31,7 +31,7 @@ from service.storage.store import Store
 
 MAX_ERRORS_KEPT = 1_000
 MAX_FAULTS_KEPT = 3
-"""Largest number of faults kept for a line: each change stores all again, read as a whole."""
+"""Largest number of faults kept for a refused line: all are stored again with each change."""
 MAX_TEXT_KEPT = 300
 SAVE_EVERY_S = 0.2
 """Seconds between stored states of a replay: each is a transaction, and an event to listeners."""
@@ -60,7 +60,7 @@ class ProgressRecorder:
         replay: records.Replay,
         on_cancelled: Callable[[], object],
     ) -> None:
-        """`on_cancelled` is called in the writer's thread if the replay's row says `cancelled`."""
+        """Begin to record; the writer's thread calls `on_cancelled` if the row says `cancelled`."""
         self._store = store
         self._now = now
         self._on_cancelled = on_cancelled
@@ -223,7 +223,7 @@ T = TypeVar("T")
 
 @runtime_checkable
 class CountedLines(Protocol):
-    """Lines decoded from an upload that is no file of lines; they count their sources."""
+    """Telemetry lines decoded from an upload of packets, with the counts of these packets."""
 
     spacecraft: str
     """Name of the mission that the lines belong to."""

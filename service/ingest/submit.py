@@ -199,7 +199,7 @@ class SubmissionService:
         wait_s: float = WAIT_S,
         tracked_ns: int | None = None,
     ) -> AnswerFuture:
-        """Queue a batch that `make` builds in the pool, unless it is recorded already.
+        """Queue a batch that `make` builds in the pool when it is computed, if not yet recorded.
 
         `tracked_ns` is the time of a batch that asks for the last attitude.  Otherwise as `queued`.
         """

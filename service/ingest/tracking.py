@@ -240,7 +240,7 @@ def _other_way_rad_s(derived: prediction.Rate, step_s: float) -> float:
 
 
 def _contradict(before: RecordedAttitude | None, last: RecordedAttitude) -> bool:
-    """True if the rates in two batches do not lead from one attitude to the other."""
+    """True if the rates of two batches, over more than a quarter turn, contradict the attitudes."""
     if before is None or not before.body_rates_deg_per_s.any():
         return False
     step_s = (last.known.tai_ns - before.known.tai_ns) * 1e-9

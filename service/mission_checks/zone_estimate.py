@@ -38,7 +38,7 @@ def geometric_k_g(mission: Mission, size_deg: float) -> float:
 
 
 RINGS = 4
-"""Number of rings of equal area about a star."""
+"""Number of rings of equal area about a star, by which its neighbours are counted."""
 ANGLES, STEPS, BEARINGS = 240, 8, 48
 """Numbers of steps across a zone, outward within a ring, and over half a turn about a star."""
 NEIGHBOURS_AT_ONCE = 4_000_000
@@ -60,7 +60,7 @@ class Neighbours:
 
 @dataclass(frozen=True)
 class Shape:
-    """Bounds of a zone, and the part of the rings about a star that lies inside.
+    """Shape of a zone: bounds from its axis, and the share inside of each ring about a star.
 
     For stars at `cosine` (k,) from the axis, ascending: `share` (k, RINGS) is the share of a ring's
     area inside, and `slope` (k, RINGS) the weight of neighbours concentrated towards the axis.
@@ -100,7 +100,7 @@ class ZoneEstimate:
 
 
 def neighbours_of(direction: Vector, limit_deg: float) -> Neighbours:
-    """Count the neighbours of unit vectors (n, 3) within an angle, by rings."""
+    """Count the neighbours of unit vectors (n, 3) within an angle, in rings of equal area."""
     from scipy.spatial import cKDTree
 
     tree: Any = cKDTree(direction)

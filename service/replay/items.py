@@ -260,7 +260,7 @@ class AttitudeCarrier:
         self._known: dict[str, _KnownAttitude] = {}
 
     def prepared(self, item: Item) -> Item:
-        """Add the carried attitude to the `a_priori` of an item; unchanged if none is known."""
+        """Set an item's `a_priori` to the attitude carried to its time, if that can be trusted."""
         if item.submission is None or item.submission.batch.measurement is not None:
             return item
         batch = item.submission.batch

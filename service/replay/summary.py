@@ -58,7 +58,7 @@ class ReplaySummary:
 
     @property
     def batches(self) -> int:
-        """Number of processed lines, without gyro blocks."""
+        """Number of processed lines, apart from accepted gyro blocks."""
         return self.new + self.replayed + self.refused
 
     def add(self, outcome: LineOutcome) -> None:
@@ -147,7 +147,7 @@ class ReplaySummary:
         }
 
     def _gyro_counts(self) -> dict[str, Any]:
-        """Counts of gyro blocks; empty if the files hold none."""
+        """Counts of gyro blocks by outcome; empty if no gyro block was recorded or repeated."""
         if not (self.gyro_new or self.gyro_replayed):
             return {}
         return {"gyro_blocks": {"new": self.gyro_new, "already_recorded": self.gyro_replayed}}
@@ -222,7 +222,7 @@ def _opened(path: Path) -> IO[bytes]:
 
 
 def _lines_in(files: Sequence[Path]) -> int | None:
-    """Number of lines in the files, for the progress bar; None if lines are not batches."""
+    """Number of lines in the files, for the progress bar; None if not batches, or unreadable."""
     count = 0
     for file in files:
         if not input_format(telemetry_format(file)).one_a_line:

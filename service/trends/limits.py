@@ -87,7 +87,7 @@ class LimitSettings(Strict):
         return found
 
     def out(self, severity: Severity, value: float, was_out: bool) -> bool:
-        """True if a value is out of a severity's bounds, or not back by the hysteresis."""
+        """True if limits are on and a value exceeds a bound, or is not back by the hysteresis."""
         bounds, within = self.bounds(severity), self.hysteresis if was_out else 0.0
         above = bounds.high is not None and value > bounds.high - within
         below = bounds.low is not None and value < bounds.low + within
@@ -95,7 +95,7 @@ class LimitSettings(Strict):
 
     @cached_property
     def _levels(self) -> tuple[tuple[Severity, float, float], ...]:
-        """Lower and upper bound for each severity; infinite if not set."""
+        """Each severity with its bounds, infinite if not set; empty if the limits are off."""
         levels = ((severity, self.bounds(severity)) for severity in Severity)
         return tuple(
             (

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from service.trends.drift import MeanStars
 
 Counts = Mapping[str, Any]
-"""Counts of one result, columns of a rollup, or SQL.
+"""Counts by name: of one result, or columns of a rollup as numbers or SQL.
 
 The names are `batches`, `observed`, `unique`, `ambiguous`, `unmatched`, `solved`, `suspect`.
 """
@@ -216,7 +216,7 @@ def alignment_offset_arcsec(stars: MeasuredStars) -> float | None:
 
 
 def a_priori_angle_deg(acquisition: "Acquisition") -> float | None:
-    """Angle from the a priori attitude to the found one in degrees; None without either.
+    """Angle from the a priori attitude to the found one in degrees; None if one is missing.
 
     If the a priori gives only an axis (the pole of a band or the boresight of a cap), the angle
     between that axis and its found direction.

@@ -72,7 +72,7 @@ COMPRESSED = (*DEFAULT_EXCLUDED_CONTENT_TYPES, TABLE_FORMATS["parquet"].media_ty
 """Media types that are sent uncompressed: compressed formats and event streams."""
 
 DIRECT = (batches.submit_batch,)
-"""Handlers called thousands of times per second, without routing: see `AroundRequests`."""
+"""Handlers that skip routing, for thousands of requests a second: see `AroundRequests`."""
 
 
 def create_app(app: App, limits: BodyLimits = DEFAULT_LIMITS) -> FastAPI:

@@ -66,7 +66,7 @@ class Live:
         self._threads = CapacityLimiter(4)
 
     async def start(self) -> None:
-        """Start to follow recorded events."""
+        """Start the tasks that follow recorded events and end the streams of revoked listeners."""
         self._poke = self._app.store.writer.bell.subscribe()
         self._last = await self._read(self._app.events.last)
         self._tasks = [
@@ -79,7 +79,7 @@ class Live:
         self._tell()
 
     async def close(self) -> None:
-        """Stop to follow recorded events, and end all streams."""
+        """Stop following recorded events, and end all streams."""
         self.stop()
         if self._tasks:
             self._app.store.writer.bell.unsubscribe(self._poke)

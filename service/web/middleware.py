@@ -364,7 +364,7 @@ class ConditionalAnswers:
 
 
 def _is_whole(message: Message) -> bool:
-    """True if a message begins an answer in one piece; streams have no content length."""
+    """True if a message begins a 200 answer in one piece; streams have no content length."""
     return (
         message["type"] == "http.response.start"
         and message["status"] == 200

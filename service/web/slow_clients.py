@@ -190,7 +190,7 @@ LINGER_S = 1
 """Seconds in which the answer to a refused head can still be read."""
 
 DISCARDED_PER_S = 50e6
-"""Bytes of bodies that are answered already, over all connections.
+"""Largest rate, in bytes per second, of reading bodies that are answered already, together.
 
 They are read to their end, because many clients look for an answer only then; read as fast
 as clients can send them, they would keep the processor from all other requests.
@@ -313,11 +313,11 @@ class _Http(HttpToolsProtocol):
     _no_head_since_s: float | None = None
     _has_sent = False
     _is_over = False
-    """Nothing that still arrives is looked at."""
+    """True once data that arrive are ignored: the connection has ended, or refused a request."""
     _answering: RequestResponseCycle | None = None
     _in_body = False
     _section_bytes = _fields = 0
-    """The size of the head or the trailers, as far as the parser has reported them."""
+    """Size in bytes and number of fields of the head or trailers that the parser has reported."""
     _head_bytes = 0
     """Bytes read, with up to `READ_BYTES` before them: the parser reports whole fields."""
     _body_bytes = _framing_bytes = 0

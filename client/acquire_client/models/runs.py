@@ -37,7 +37,7 @@ class ReplayCounts(Model, frozen=True, kw_only=True):
     repeated: int
     """Batches that were already recorded."""
     observed: int
-    """Observed stars of the replay's batches; the next fields count them by outcome."""
+    """Number of observed stars of the replay's batches; the next fields count them by outcome."""
     unique: int
     ambiguous: int
     unmatched: int
@@ -61,7 +61,7 @@ class ApidPackets(Model, frozen=True, kw_only=True):
     missing: int
     """Packets that are missing in these places."""
     backward: int
-    """Places where the sequence count repeats or goes back: after a reset, or in changed order."""
+    """Number of places where the sequence count repeats or goes back: a reset, or another order."""
     refused: int
     incomplete: int = 0
     """Segments of packets of which others are missing."""
@@ -94,13 +94,13 @@ class ReplayPackets(Model, frozen=True, kw_only=True):
     joined: int = 0
     """Packets that were joined of segments."""
     incomplete: int = 0
-    """Segments of incomplete packets; they are counted as refused as well."""
+    """Number of segments of incomplete packets; they are counted as refused as well."""
     unread_bytes: int = 0
-    """Bytes from the first unreadable packet of each file to the end of the file."""
+    """Number of bytes from the first unreadable packet of each file to the end of the file."""
     empty_files: int = 0
     """Files without a packet."""
     without_attitude: int = 0
-    """Packets whose a priori quaternion was zero or not finite."""
+    """Number of packets whose a priori quaternion was zero or not finite."""
     apids: Sequence[ApidPackets]
     """The hundred APIDs with the most packets."""
 

@@ -69,8 +69,7 @@ def _add_new(group: Any) -> None:
 
 
 def new(parsed: Namespace) -> int:
-    """Print a mission file of some ten lines, with comments; without a name on a terminal, ask for
-    its values.
+    """Print a short mission file with comments; without a name on a terminal, ask for its values.
 
     acquire mission new MYCUBE --field 8x8 --sigma 5 --limit 6.5 --a-priori-error 0.5 > my.toml
     acquire mission new > my.toml

@@ -102,7 +102,7 @@ def utc_short(moment: str) -> Markup:
 
 
 def age(seconds: float | None) -> str:
-    """Duration in its two largest units, from a hundred days in days alone."""
+    """Text of a duration in its two largest units, from a hundred days in days alone."""
     if seconds is None:
         return DASH
     whole = max(0, round(seconds))
@@ -122,7 +122,7 @@ def age(seconds: float | None) -> str:
 
 
 def share(part: float | None, whole: float | None = 1) -> str:
-    """Percentage to two or three digits; a dash without a whole."""
+    """Text of a percentage to two or three digits; a dash without a value or a whole."""
     if part is None or not whole:
         return DASH
     percent = 100 * part / whole
@@ -131,21 +131,21 @@ def share(part: float | None, whole: float | None = 1) -> str:
 
 
 def number(value: float | None, decimals: int = 2) -> str:
-    """Number with a fixed number of decimals, and a true minus sign."""
+    """Text of a number with fixed decimals and a true minus sign; a dash if not finite."""
     if value is None or not math.isfinite(value):
         return DASH
     return f"{value:.{decimals}f}".replace("-", "−")
 
 
 def level(value: float) -> str:
-    """Number to four digits, without an exponent for small values."""
+    """Text of a number to four digits, without an exponent for small values."""
     if value == 0.0:
         return "0"
     return number(value, min(9, max(0, 3 - math.floor(math.log10(abs(value))))))
 
 
 def arcsec(value: float | None) -> str:
-    """Angle in arcseconds to three digits; from 3600 arcseconds in degrees."""
+    """Text of an angle in arcseconds to three digits; from 3600 arcseconds in degrees."""
     if value is None or not math.isfinite(value):
         return DASH
     if abs(value) >= 3600:
@@ -155,27 +155,27 @@ def arcsec(value: float | None) -> str:
 
 
 def degrees(value: float | None, decimals: int = 3) -> str:
-    """Angle in degrees."""
+    """Text of an angle in degrees; a dash without a value."""
     return DASH if value is None else f"{number(value, decimals)}°"
 
 
 def magnitude(value: float | None, decimals: int = 2) -> str:
-    """Magnitude with its unit."""
+    """Text of a magnitude with its unit; a dash without a value."""
     return DASH if value is None else f"{number(value, decimals)}{THIN}mag"
 
 
 def count(value: int | None) -> str:
-    """Whole number with digits in groups of three."""
+    """Text of a whole number with digits in groups of three; a dash without a value."""
     return DASH if value is None else f"{value:,}".replace(",", THIN)
 
 
 def plural(number: int, word: str) -> str:
-    """Count with its noun."""
+    """Text of a count with its noun, in the plural unless it is one."""
     return f"{count(number)} {word}{'' if number == 1 else 's'}"
 
 
 def microseconds(value: float | None) -> str:
-    """Duration in microseconds; long ones in milliseconds."""
+    """Text of a duration in microseconds, of a long one in milliseconds."""
     if value is None:
         return DASH
     if value >= 10_000:
@@ -184,7 +184,7 @@ def microseconds(value: float | None) -> str:
 
 
 def size(value: int) -> str:
-    """Size of a file or of memory with its unit."""
+    """Text of the size of a file or of memory, with its unit."""
     for least, unit in ((1_000_000_000, "GB"), (1_000_000, "MB"), (1_000, "kB")):
         if value >= least:
             return f"{value / least:.1f}{THIN}{unit}"
@@ -192,7 +192,7 @@ def size(value: int) -> str:
 
 
 def sigmas(covariance_arcsec2: Sequence[Sequence[float]]) -> list[float]:
-    """Standard deviations about the body axes."""
+    """Standard deviations about the body axes, from a covariance matrix of the attitude."""
     return [math.sqrt(max(covariance_arcsec2[k][k], 0.0)) for k in range(3)]
 
 
@@ -207,12 +207,12 @@ REASONS: Mapping[str, str] = {
 
 
 def reason(code: str | None) -> str:
-    """Readable reason; a code of another version without its underscores."""
+    """Readable text for a reason code; a code of another version without its underscores."""
     return REASONS.get(code or "", plain(code))
 
 
 def warning(text: str) -> tuple[str, str]:
-    """Sentence and code of a warning."""
+    """Sentence for a warning of a batch, and the code of the warning."""
     code, _, said = text.partition(":")
     said = said.strip()
     if said in REASONS:
@@ -221,7 +221,7 @@ def warning(text: str) -> tuple[str, str]:
 
 
 def typed_time(moment: Utc | str | None) -> str:
-    """Time for a form field: to the second if no fraction follows."""
+    """Text of a time for a form field: to the second if no fraction follows."""
     if moment is None or moment == "":
         return ""
     text = moment if isinstance(moment, str) else moment.text
@@ -229,12 +229,12 @@ def typed_time(moment: Utc | str | None) -> str:
 
 
 def plain(word: str | None) -> str:
-    """Readable word of the interface: `no_attitude` without its underscore."""
+    """Readable word for a name of the interface: `no_attitude` without its underscore."""
     return (word or "").replace("_", " ")
 
 
 def state(name: str | None, words: str | None = None) -> Markup:
-    """Shape and word of a state, or another text, with a class for its colour."""
+    """HTML of a state: its shape, its word or another text, and a class for its colour."""
     name = name or "no_attitude"
     shape, word = STATES[name][0], words or STATES[name][1]
     return Markup('<span class="state {}"><span aria-hidden="true">{}</span> {}</span>').format(
@@ -256,7 +256,7 @@ def _in_percent(known: Quantity) -> bool:
 
 
 def quantity(value: float | None, name: str) -> str:
-    """Value of a quantity with its unit."""
+    """Text of the value of a quantity with its unit; a dash without a value."""
     if value is None:
         return DASH
     known = quantity_named(name)
@@ -274,14 +274,14 @@ def unit_of(name: str) -> str:
 
 
 def entered(value: float | None, name: str) -> str:
-    """Bound of a quantity in its `unit_of` for a form field; empty without one."""
+    """Text of a quantity's bound in its `unit_of`, for a form field; empty without one."""
     if value is None:
         return ""
     return f"{100 * value if _in_percent(quantity_named(name)) else value:.6g}"
 
 
 def bounds(settings: Mapping[str, Any], name: str) -> str:
-    """Limits of a quantity in words."""
+    """Text on the limits of a quantity: bounds, hysteresis, number of batches and duration."""
     if not settings["enabled"]:
         return "off"
     parts = [
@@ -304,7 +304,7 @@ _INVISIBLE = re.compile(
     r"\u2028-\u202e\u2060-\u206f\u2800\u3164\ufe00-\ufe0f\ufeff\uffa0\ufff0-\ufffb"
     r"\U000e0000-\U000e0fff]"
 )
-"""Invisible characters, and those that change the direction of text."""
+"""Pattern of invisible characters, and of those that change the direction of text."""
 
 
 def name(text: str) -> str:

@@ -98,7 +98,7 @@ class PageQuery(Query):
 
 
 def typed_utc(text: str, field: str) -> Utc:
-    """Time as people type it; raises `BadInput` naming the field."""
+    """Parse a time as people type it; raises `BadInput` naming the field."""
     return parse_utc(completed_utc(text), field)
 
 
@@ -341,7 +341,7 @@ _DOCUMENTED = re.compile(r'href="(/(?:docs|problems)[^"#]*)')
 
 
 def _of_run(text: Markup, run: str) -> Markup:
-    """Kept part of a page, with links to other pages that keep the shown run."""
+    """Cached HTML of a part of a page, with the shown run in its links to other pages."""
     if run == LIVE:
         return text
     return Markup(_DOCUMENTED.sub(rf'href="\1?{urlencode({"run": run})}', str(text)))

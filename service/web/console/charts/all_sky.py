@@ -100,7 +100,7 @@ def _hammer(longitude_rad: Vector, latitude_rad: Vector) -> Vector:
 
 
 def all_sky_chart(period: PeriodStars, shown: list[TrackerStarsOfPeriod]) -> AllSkyChart:
-    """Chart of a period with the tracks of some of its trackers."""
+    """Chart of the whole sky in a period: tracks of the shown trackers, the Sun and zones."""
     longitudes = np.radians(np.arange(0.0, 360.0 + STEP_DEG, STEP_DEG))
     plane = from_ra_dec(*np.degrees(erfa.g2icrs(longitudes, np.zeros_like(longitudes))))
     centre = from_ra_dec(*np.degrees(erfa.g2icrs(0.0, 0.0)))
@@ -160,7 +160,7 @@ def _track(period: PeriodStars, tracker: TrackerStarsOfPeriod) -> Track:
 
 
 def _marks(places: Vector, shape: str) -> Path:
-    """Path with a mark at every position, but only one per pixel."""
+    """SVG path with a mark of a shape at every position, but only one per pixel."""
     whole = np.unique(np.round(places), axis=0).astype(int).tolist()
     return "".join(f"M{x} {y}{shape}" for x, y in whole)
 
@@ -173,13 +173,13 @@ def _joined(direction: Vector) -> Path:
 
 
 def _edges(region: SearchRegion) -> Path:
-    """Path of the bounds of a zone: one circle for a cap, two for a band."""
+    """SVG path of the bounds of a zone: one circle for a cap, two for a band."""
     bounds = (region.least_deg, region.most_deg)
     return "".join(_line(_circle(region.axis, each)) for each in bounds if 0.0 < each < 180.0)
 
 
 def _circle(axis: Vector, angle_deg: float) -> Vector:
-    """Directions of the circle at an angle from an axis."""
+    """Unit vectors (n, 3) along the circle at an angle from an axis."""
     first = unit(np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))]))
     second = np.cross(axis, first)
     turn = np.radians(np.arange(0.0, 360.0 + STEP_DEG, STEP_DEG))[:, None]
@@ -218,7 +218,7 @@ def _place(point: Vector) -> Place:
 
 
 def _line(direction: Vector, breaks: npt.NDArray[np.bool_] | None = None) -> Path:
-    """Path through directions, broken at the seam of the projection and at given places.
+    """SVG path through directions, broken at the seam of the projection and at given places.
 
     `breaks` tells for every direction but the first whether the line begins anew there.
     """

@@ -39,7 +39,7 @@ class Cell:
     y: float
     shade: int
     arrow: str
-    """SVG path; empty with too few stars."""
+    """SVG path of the arrow for the mean residual; empty with too few stars."""
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ ROOM = 0.04
 
 @dataclass(frozen=True)
 class Trace:
-    """SVG path of one kind of values: `line` for joined values, `dots` for lone ones."""
+    """SVG paths of one kind of values: `line` joins neighbours, `dots` marks lone values."""
 
     kind: str
     line: str
@@ -45,13 +45,13 @@ class TimeAxis:
     end: Utc
 
     def x(self, time_ns: Integers) -> Integers:
-        """Units (n,) from the left edge."""
+        """Horizontal positions (n,) of times, in units from the left edge of the chart."""
         length = max(self.end.tai_ns - self.start.tai_ns, 1)
         along = np.clip((time_ns - self.start.tai_ns) / length, 0.0, 1.0)
         return np.asarray(np.rint(PAD + along * (WIDTH - 2 * PAD)).astype(np.int64))
 
     def ticks(self) -> list[tuple[float, str]]:
-        """Round times of the period: percent from the left, and text in UTC."""
+        """Tick marks at round times of the period: percent from the left, and text in UTC."""
         length_s = (self.end.tai_ns - self.start.tai_ns) * 1e-9
         step_s = next((step for step in TIME_STEPS_S if length_s <= MOST_TICKS * step), None)
         if step_s is None or length_s <= 0.0:
@@ -95,7 +95,7 @@ class Scale:
         return self.high - self.low + 2.0 * (ROOM * (self.high - self.low) or 1.0)
 
     def y(self, value: Vector) -> Integers:
-        """Units (n,) from the top; values beyond an edge are placed at it."""
+        """Vertical positions (n,) of values, in units from the top; beyond an edge, at the edge."""
         low, high = self.low, self.high
         if self.is_log:
             value, low, high = np.log(np.maximum(value, low)), np.log(low), np.log(high)
@@ -149,7 +149,7 @@ def band_path(x: Integers, upper: Integers, lower: Integers, parts: Sequence[Int
 
 
 def parts_of(joins: Mask) -> list[Integers]:
-    """Indices of each joined part."""
+    """Indices of the values in each run of joined ones."""
     if not len(joins):
         return []
     return np.split(np.arange(len(joins)), np.flatnonzero(~joins[1:]) + 1)

@@ -130,7 +130,7 @@ class Labels:
 
 
 def text_box(text: str, x: float, y: float, font: Font = NAME) -> Box:
-    """Box of a text that begins at the position of its baseline."""
+    """Box covered by a text whose baseline begins at a position."""
     top = y - 0.8 * font.height
     return x, top, x + font.character * len(text), top + font.height
 
@@ -167,12 +167,12 @@ AXES: tuple[Box, ...] = (
     (SIZE - 30.0, SIZE / 2 - 20.0, SIZE, SIZE / 2 - 2.0),
     (SIZE / 2, 0.0, SIZE / 2 + 34.0, 18.0),
 )
-"""Boxes of the axis names."""
+"""Boxes covered by the names of the chart's axes."""
 
 
 @dataclass(frozen=True)
 class CatalogStar:
-    """Catalog star of the zone; `role` is chosen, rival or none."""
+    """Catalog star of the zone on a chart; `role`: chosen for an observed star, rival, or none."""
 
     id: str
     magnitude: float
@@ -257,7 +257,7 @@ class _Projection:
         return x, SIZE / 2 - self.scale * math.tan(math.radians(v_deg))
 
     def ring(self, radius_deg: float) -> Ring:
-        """Circle about the boresight."""
+        """Circle of the grid at a radius about the boresight, with its label."""
         return Ring(self.scale * math.tan(math.radians(radius_deg)), f"{radius_deg:g}°")
 
 

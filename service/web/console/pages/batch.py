@@ -45,7 +45,7 @@ from service.web.requests.access import Policy
 from service.web.requests.query_parameters import Cursor
 
 VIEWS = ("all", "field")
-"""Content of the chart: all candidates of the answer, or the field of view only."""
+"""Contents of the chart to choose from: all candidates, or the field of view only."""
 
 MUCH_WORSE = 2.0
 """Greatest ratio of a new residual to the former and the predicted one without a warning."""
@@ -177,7 +177,7 @@ def adoption(before: Answer, after: Answer) -> list[str]:
 
 
 def _worse_fit(before: Answer, after: Answer) -> list[str]:
-    """Warning with both figures if the residuals of the new attitude are much larger."""
+    """Warning if a what-if loses the attitude, or has much larger residuals; otherwise empty."""
     if after.attitude is None:
         return ["▲ The new result has no attitude."] if before.attitude else []
     if after.attitude.residual_rms_arcsec is None:
@@ -252,7 +252,7 @@ def _pointing(shown: Answer) -> list[dict[str, Any]]:
 
 ROWS = 50
 Any_ = Literal[""]
-"""Empty field of a form: any value."""
+"""Type of an empty form field, which selects any value."""
 
 
 class BatchesQuery(PeriodQuery):
@@ -262,7 +262,7 @@ class BatchesQuery(PeriodQuery):
     outcome: OutcomeName | Any_ = ""
     status: StatusName | Any_ = ""
     find: Annotated[str, Field(max_length=200)] = ""
-    """Id of a batch from its sender or from this service; or a time."""
+    """Text that the search form sends: the id of a batch or of a result, or a time."""
     cursor: Cursor = None
 
 

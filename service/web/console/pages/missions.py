@@ -27,7 +27,7 @@ class SettingDifference:
 
     @property
     def factor(self) -> float | None:
-        """Ratio of the new number to the old one; None unless both are numbers."""
+        """Ratio of the new number to the old one; None if one is no number, or the old is 0."""
         numbers = [
             each
             for each in (self.before, self.after)
@@ -47,7 +47,7 @@ class SettingsEntry:
 
 
 class MissionsQuery(PageQuery):
-    """Mission whose settings are shown in full; an empty field selects every mission."""
+    """Query for the mission whose settings are shown in full; an empty field selects all."""
 
     spacecraft: Key | Literal[""] = ""
 
@@ -95,7 +95,7 @@ def missions_page(query: FromQuery[MissionsQuery], context: ContextDep) -> Respo
 
 
 def _sections(settings: Mapping[str, Any]) -> Iterator[tuple[str, list[tuple[str, Any]]]]:
-    """Titles with flat settings; each tracker is a section of its own."""
+    """Sections of a mission's settings, each a title and flat settings; one for each tracker."""
     plain = [(k, v) for k, v in settings.items() if not isinstance(v, dict | list)]
     yield "general", [each for each in plain if each[0] not in ("name", "description")]
     for name, value in settings.items():

@@ -198,7 +198,7 @@ def overview_page(query: page.FromQuery[OverviewQuery], context: page.ContextDep
 
 
 def _words_of(lines: list[OverviewLine]) -> str:
-    """Numbers of rows with faults, without faults, and without any batch."""
+    """Text with the numbers of rows with faults, without faults, and without any batch."""
     silent = [line for line in lines if not line.item.latest_batch]
     trouble = [line for line in lines if line.in_trouble and line.item.latest_batch]
     parts = (

@@ -81,7 +81,7 @@ def _tracker_charts(tracker: TrackerStarsOfPeriod) -> TrackerCharts:
 
 
 def without_gyro(context: PageContext, name: str, run: str, shown: ShownPeriod) -> str:
-    """Missing inputs of a filter in a period, with their effect; empty with gyro data."""
+    """Sentences that no gyro data exist in a period, and on the effect; empty if there are any."""
     if context.app.gyro.page(name, run=run, start=shown.start, end=shown.end, limit=1).items:
         return ""
     mission = context.app.context.known[name]

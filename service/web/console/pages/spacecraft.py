@@ -112,7 +112,7 @@ class SpacecraftQuery(PageQuery):
 
 
 def range_s(text: str) -> int:
-    """Length of a range."""
+    """Length in seconds of a period given by name, or such as `6h`."""
     if text in RANGES_S:
         return RANGES_S[text]
     number = text.rstrip("".join(UNITS_S))
@@ -129,7 +129,7 @@ class ShownPeriod:
 
     @property
     def seconds(self) -> float:
-        """Length of the period."""
+        """Length of the period in seconds."""
         return (self.end.tai_ns - self.start.tai_ns) / 1e9
 
     @property
@@ -246,7 +246,7 @@ def _fitting_range(context: PageContext, name: str, run: str, end: Utc) -> Range
 def _worst(
     context: PageContext, name: str, query: SpacecraftQuery, stretch: ShownPeriod | None
 ) -> Ranking:
-    """Worst batches by a quantity: by default the first one with a value above zero."""
+    """Worst batches by a quantity: by default the first one whose worst value is not zero."""
     asked = (query.by,) if query.by else FIRST_LOOKED_AT
     if query.tracker and not query.by:
         asked = tuple(by for by in FIRST_LOOKED_AT if QUANTITIES[by].by_tracker)
