@@ -10,7 +10,7 @@ _PACKAGE = Path(__file__).resolve().parent
 
 
 def shipped(*parts: str) -> Path:
-    """Path of a shipped file or folder, e.g.  `shipped("catalogs", "stars.npz")`.
+    """Path of a shipped file or folder, as in `shipped("catalogs", "stars.npz")`.
 
     `parts` are the names of the path in the checkout.  A missing file is reported only when
     it is opened.

@@ -346,7 +346,7 @@ def positive(text: str) -> float:
 
 
 def degrees(text: str) -> float:
-    """Parse a field of view in degrees, above 0 and below 120, for an option."""
+    """Parse a field of view in degrees, above 0 and at most 180, for an option."""
     number = positive(text)
     if number > 180:
         raise argparse.ArgumentTypeError(f"must be at most 180 degrees (got {text!r})")

@@ -159,7 +159,7 @@ def report_text(report: MissionReport) -> str:
 
 
 def _sentences(report: MissionReport) -> list[str]:
-    """Capabilities of a mission, in sentences."""
+    """Wrapped sentences on a mission's views, zone and expected outcomes."""
     mission, zone = report.mission, report.mission.zone
     lines = [
         f"{view.tracker} sees {FEW_STARS} stars or more in {100.0 * (1.0 - view.few_share):.0f} % "

@@ -27,7 +27,7 @@ from service.ingest.worker_process import WorkerConfig
 from service.storage.archive.folder import write_whole
 
 RETRIES = 3
-"""Retries of a task that raises; after a worker's death the scheduler moves the task itself."""
+"""Number of retries of a task that raises; the scheduler itself moves tasks of dead workers."""
 CONNECT_S = 20
 FEWEST_PENDING, PENDING_A_WORKER = 4, 2
 SCHEMES = ("tls://", "tcp://")

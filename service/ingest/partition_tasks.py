@@ -233,7 +233,7 @@ def attempt(solver: Solver, task: PartitionTask) -> list[Outcome]:
 
 
 def unwritten(task: PartitionTask, error: OSError) -> BadConfiguration:
-    """Convert an error of the disk, such as a full one, to a message that names the file."""
+    """Convert an error of the disk, such as a full one, to an error that names the file."""
     file = error.filename or task.target
     return BadConfiguration(f"{file}: {error.strerror or error}")
 

@@ -76,7 +76,7 @@ def _round_field_deg(tracker: Tracker) -> float:
 
 
 def axis_findings(mission: Mission) -> list[Finding]:
-    """Findings on the length of the zone's axis vector."""
+    """Findings on the axis of a zone whose vector is not of length one."""
     length = math.hypot(*mission.zone.axis_body)
     if abs(length - 1.0) > 1e-3:
         text = f"has the length {length:g}; it is used as a direction, so check its components"

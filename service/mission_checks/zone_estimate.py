@@ -49,7 +49,8 @@ VOXEL_BITS_PER_STAR = 128
 class Neighbours:
     """Numbers of neighbours of each star in a run catalog, in rings up to HMAX.
 
-    `count` is (n, RINGS), `total` (n, RINGS, 3) the sum of the neighbours' unit vectors.
+    `count` is (n, RINGS), `total` (n, RINGS, 3) the sum of the neighbours' unit vectors, in the
+    first ring with the star's own.
     """
 
     direction: Vector

@@ -143,7 +143,7 @@ class FromFile(ABC):
     """
 
     option: str
-    """Command option that names the file."""
+    """Option of `acquire replay` that names the file with the data."""
     key: str
     """Name of the count of supplied batches in the command's JSON."""
     title: str

@@ -251,7 +251,7 @@ class Connection(asyncio.BufferedProtocol):
         self._http.pause_writing()
 
     def resume_writing(self) -> None:
-        """Handle a drained send buffer."""
+        """Handle a send buffer that has room again: the app may send more."""
         self._http.resume_writing()
 
     def eof_received(self) -> None:
@@ -524,7 +524,7 @@ class _Http(HttpToolsProtocol):
         self._start_unread_timer()
 
     def resume_writing(self) -> None:
-        """Handle a drained send buffer."""
+        """Handle a send buffer that has room again: the app may send more."""
         self._stop_unread_timer()
         super().resume_writing()
 

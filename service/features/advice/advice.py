@@ -135,7 +135,7 @@ def variant_outcome(
 
 
 def _change(counts: Sequence[TrialCounts], present: Sequence[TrialCounts]) -> Interval | None:
-    """Change of the share of stars not unique, in percentage points, with its 95 % interval."""
+    """Change of the percentage of stars not unique, with its 95 % interval; None with too few."""
     stars = np.array([each.observed for each in counts], float)
     lost = np.array(
         [before.unique - after.unique for after, before in zip(counts, present, strict=True)],

@@ -160,7 +160,7 @@ def _all_within(values: Sequence[float], limits: LimitSettings) -> bool:
 
 
 def _means(samples: Sequence[Sample], count: int, known: int) -> list[float]:
-    """Means over `count` consecutive samples that end after the first `known` ones, and two bounds.
+    """Means over `count` samples, ending after the first `known` ones, and bounds for rounding.
 
     The least and the greatest mean are widened by the rounding error of differences of running
     sums.

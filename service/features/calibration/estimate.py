@@ -132,12 +132,12 @@ def calibrate(stars: IdentifiedStars, model: Model) -> Calibration:
 
 
 def fit(stars: IdentifiedStars, model: Model) -> Fit:
-    """Fit a calibration model to stars that are sorted as by `by_tracker`."""
+    """Fit a calibration model to stars that are sorted as by `usable`."""
     return _run(begun(stars, model), stars, model)
 
 
 def _run(found: Fit, stars: IdentifiedStars, model: Model) -> Fit:
-    """Repeat the linearised fit from its last result until a repetition changes nothing."""
+    """Repeat the linearised fit from its last result until nothing changes, up to a limit."""
     for number in range(LINEARISATIONS):
         steps, far = _settle(found, stars, model, number > 0)
         if steps == 1 and not far:

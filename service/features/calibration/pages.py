@@ -133,7 +133,7 @@ def _recorded(context: PageContext, name: str) -> int:
 def _shown(
     read: Callable[[str], Calibration], versions: Sequence[CalibrationSummary], version: int | None
 ) -> Calibration | None:
-    """Calibration with the requested version, or the latest that is done; raises `NotFound`."""
+    """Requested version of a calibration, or the latest done one or None; raises `NotFound`."""
     for each in versions:
         if each.version == version or (version is None and each.state == "done"):
             return read(each.id)

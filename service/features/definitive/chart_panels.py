@@ -20,7 +20,7 @@ class ChartPanel:
     band: str
     marks: str
     bounds: tuple[int, ...]
-    """Vertical positions of horizontal lines."""
+    """Vertical positions of the horizontal lines that mark bounds."""
     note: str
     """Caption of the panel: the range of values and remarks."""
     scale: "Scale"

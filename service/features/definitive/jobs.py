@@ -34,7 +34,7 @@ LOOK_EVERY_S = 600.0
 
 @dataclass(frozen=True)
 class _Wanted:
-    """Days that a job computes."""
+    """Spacecraft, run and period whose days a job computes."""
 
     spacecraft: str
     run: str

@@ -43,7 +43,7 @@ FETCH_S = 1.0
 PAUSE_S = 1
 BEGIN_AGAIN_S = 5.0
 TRIES = 5
-"""Failed attempts of the service to process a message before the follower refuses it."""
+"""Number of times that the service fails at a message before the follower refuses it."""
 UNKEPT_S = 60.0
 """Seconds before a follower asks again whether a stream keeps a subject."""
 MESSAGE_TOO_LARGE = 10_054

@@ -38,7 +38,7 @@ class StarBatch:
     body: dict[str, Any]
     columns: list[TrackerColumns] = field(default_factory=list)
     slots: list[list[int]] = field(default_factory=list)
-    """Packet slots of each tracker's stars."""
+    """Indices of the packet slots that hold each tracker's stars."""
 
     def has_stars(self) -> bool:
         """True if any tracker has a star in the batch."""

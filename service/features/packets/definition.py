@@ -26,7 +26,7 @@ MAX_EXPONENT = 64
 MAX_BITS = 8 * (65536 + 6)
 MAX_LABELLED = 65_536
 MAX_DEPTH = 16
-"""Greatest nesting of arrays and aggregates."""
+"""Greatest depth to which arrays and aggregates of an XTCE file may be nested."""
 
 _XTCE_WORD = "xtce"
 _MOVED = ("LocationInContainerInBits", "RepeatEntry", "IncludeCondition")
@@ -168,7 +168,7 @@ class _Expansion:
                 raise XtceFault(each, message, each.get("sizeInBits"))
 
     def _require_clear(self, kind: Any) -> None:
-        """Normalise spellings, byte orders and booleans that the library would ignore."""
+        """Normalise or refuse spellings, byte orders and booleans that the library would ignore."""
         for each in kind.iter(_named("FloatDataEncoding")):
             spelling = each.get("encoding")
             if spelling in _SPELLINGS:

@@ -146,7 +146,7 @@ class ApidCounts(Struct, kw_only=True):
     gaps: int = 0
     """Number of places where the sequence count skips packets."""
     missing: int = 0
-    """Number of packets missing at these gaps of the sequence count."""
+    """Number of packets missing at the gaps of the sequence count."""
     backward: int = 0
     """Number of places where the count repeats or goes back: a reset, or packets out of order."""
     incomplete: int = 0

@@ -6,6 +6,6 @@ from service.features.pictures import any_camera, camera
 
 
 def add(commands: Any) -> None:
-    """Declare the commands."""
+    """Extend `acquire frame` for pictures of any camera, and declare `acquire camera`."""
     any_camera.extend(commands.choices["frame"])
     camera.add(commands)

@@ -88,5 +88,5 @@ class Pictures:
 
 
 def open_part(app: App) -> Pictures:
-    """The pictures of an open application."""
+    """Create the service for pictures of an open app."""
     return Pictures(app)

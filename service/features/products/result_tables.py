@@ -25,7 +25,7 @@ from service.trends.quantities import QUANTITIES
 from service.vectors import Vector
 
 PAGE = 5_000
-"""Number of rows read at once."""
+"""Number of database rows read at once for a table."""
 
 _QUALITY = ("residual_rms_arcsec", "predicted_rms_arcsec")
 _QUERY: Select[Any] = (

@@ -440,7 +440,7 @@ def _gathered(
 def _log10_expected(
     points: Points, motion: Motion, own: Indices, density: Vector, pairs: int
 ) -> float:
-    """Log10 of the expected number of such motions among random points."""
+    """Log10 of the number of motions with as many points expected among random points."""
     time_s = points.time_s[own]
     _, variance = offsets(motion, (time_s, points.direction[own], points.covariance[own]))
     whole = variance + motion.spread(time_s)

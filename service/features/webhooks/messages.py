@@ -159,7 +159,7 @@ RESULTS: tuple[Result, ...] = ("delivered", "failed", "dead")
 
 @dataclass
 class _Failing:
-    """Failed attempts and dead letters since the last successful attempt."""
+    """Numbers of failed attempts and of dead letters since a webhook's last successful attempt."""
 
     failed: int = 0
     dead: int = 0

@@ -83,7 +83,7 @@ def list_attitudes(
     Returns("The buckets with batches.", models.RateList),
 )
 def list_rates(name: SpacecraftPath, query: FromQuery[params.RatesQuery], app: AppDep) -> Response:
-    """Stars by outcome, in at most 20,000 buckets of batch time."""
+    """Numbers of stars by outcome, in at most 20,000 buckets of batch time."""
     return json_response(models.RateList(items=app.spacecraft.rates(name, **query.asked())))
 
 
@@ -100,7 +100,7 @@ def get_history(
     exports: ExportsDep,
     caller: CallerDep,
 ) -> Response:
-    """Quantities over a period.
+    """Histories of quantities over a period.
 
     Thinned out to as many points as can be drawn, or as a table of every batch.
     """

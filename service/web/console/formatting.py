@@ -45,7 +45,7 @@ STATES: Mapping[str, tuple[str, str]] = {
     "tracking": ("●", "tracking"),
     "lost": ("✕", "lost"),
 }
-"""Shape and word of every state."""
+"""Shape and word that show a state, by the name of the state."""
 
 
 _TYPED = re.compile(

@@ -43,7 +43,7 @@ Handler = Callable[..., Any]
 
 @dataclass(frozen=True)
 class ConsolePage:
-    """Page of the console.
+    """A registered page of the console: address, title, handler and place in the navigation.
 
     `section` is the path of the navigation entry that is marked on the page.
     `position` orders the entries of the navigation; a page without one has no entry.
@@ -241,7 +241,7 @@ class PageContext:
         return "operate" in self.caller.scopes
 
     def rendered(self, template: str, run: str, **values: Any) -> Response:
-        """Rendered page with a run."""
+        """Render a template as a page of the console about a run."""
         return rendered(template, self._layout(run), **values)
 
     def panels(self, page: str, *shown: Any) -> list[Any]:

@@ -268,7 +268,7 @@ async def _on_query_fault(request: Request, error: Exception) -> Response:
 
 
 async def on_http_error(request: Request, error: Exception) -> Response:
-    """Problem answer to an unknown address or method."""
+    """Problem answer to an HTTP error of the framework, such as an unknown address."""
     assert isinstance(error, HTTPException)
     phrase = HTTPStatus(error.status_code).phrase
     headers = dict(error.headers or {})

@@ -49,8 +49,9 @@ class BodyLimits:
     session_bytes: int = 4 << 10
     """Greatest size in bytes of the body of `POST /session`, which needs no token."""
     small_bytes: int = 8 << 10
-    """Bytes of each body that `budget_bytes` leaves out: a batch of 60 stars is never
-    refused because of others."""
+    """Number of bytes of each body that the common budget leaves out: a batch of 60 stars is never
+    refused because of others.
+    """
     budget_bytes: int = 8 << 20
     replay_bytes: int = 1 << 30
     pause_s: float = 20.0

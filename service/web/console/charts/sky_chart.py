@@ -30,9 +30,9 @@ RIVAL_MARGIN = 6.0
 
 Place = tuple[float, float]
 Box = tuple[float, float, float, float]
-"""Left, top, right and bottom of a box."""
+"""Box in a picture: left, top, right and bottom, in pixels."""
 Circle = tuple[float, float, float]
-"""Centre and radius of a circle."""
+"""Circle in a picture: centre and radius, in pixels."""
 
 GAPS = (14.0, 22.0, 32.0, 44.0, 60.0)
 """Distances in pixels from a star to its label, the nearest first."""
@@ -52,7 +52,7 @@ CELL = 2.0
 
 @dataclass(frozen=True)
 class Font:
-    """Size of a font in pixels."""
+    """Font of labels: width of a character and height of a line, in pixels."""
 
     character: float
     height: float
@@ -382,14 +382,14 @@ def _arrow_scale(lengths_arcsec: Sequence[float]) -> tuple[float, float | None]:
 
 
 def _rings(radius_deg: float, field_deg: float) -> list[float]:
-    """Two or three round radii within the picture, apart from the edge of the field of view."""
+    """Up to four round radii within the picture, apart from the edge of the field of view."""
     step = next(s for s in (0.25, 0.5, 1.0, 2.0, 5.0, 10.0) if radius_deg / s <= 4.0)
     count = int(radius_deg / step)
     return [step * k for k in range(1, count + 1) if abs(step * k - field_deg) > step / 4]
 
 
 def _head(arrow: ChartLine) -> str:
-    """Corner points of an arrow's head."""
+    """Corner points of an arrow's head, as text for an SVG polygon; empty without a length."""
     length = math.hypot(arrow.x2 - arrow.x1, arrow.y2 - arrow.y1)
     if length == 0.0:
         return ""

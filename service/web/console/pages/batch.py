@@ -193,7 +193,7 @@ def _worse_fit(before: Answer, after: Answer) -> list[str]:
 
 @console_page("/latest/{name}", "Latest batch", Policy("read", "path"), section="/batches")
 def latest_batch(name: str, query: FromQuery[PageQuery], context: ContextDep) -> Response:
-    """Redirect to the latest batch of a spacecraft in a run."""
+    """Redirect to the latest batch of a spacecraft in a run, or else to the spacecraft's page."""
     items = context.app.results.page(spacecraft=name, run=query.run, limit=1).items
     address = f"/batches/{items[0].id}" if items else f"/spacecraft/{quote(name)}"
     return RedirectResponse(f"{address}?{urlencode({'run': query.run})}", 303)
@@ -219,7 +219,7 @@ def _stars(shown: Answer, before: Answer | None, field: StarField) -> list[VoteR
 
 
 def _trackers(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Residual of each tracker over the predicted one, on a common scale."""
+    """Values of each tracker, with its residual over the predicted one, on a common scale."""
     ratio_of = QUANTITIES["residual_ratio"].value_of
     ratios = [ratio_of(row) for row in rows]
     scale = max(SCALE, *(each or 0.0 for each in ratios)) if ratios else SCALE

@@ -41,7 +41,7 @@ SPARK_QUANTITIES = ("ambiguous_share", "unmatched_share")
 
 
 def share_names() -> tuple[str, ...]:
-    """Quantities of the heat map."""
+    """Names of the quantities that the heat map can show: shares."""
     return tuple(name for name, each in QUANTITIES.items() if each.is_share)
 
 
