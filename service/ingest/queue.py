@@ -460,9 +460,9 @@ class RecordedCounts:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self.batches: Counter[tuple[str, bool, bool]] = Counter()
-        """Batches by spacecraft, live or not, and with attitude or without."""
+        """Number of batches by spacecraft, live or not, and with attitude or without."""
         self.stars: Counter[tuple[str, bool, str]] = Counter()
-        """Stars of the batches by spacecraft, live or not, and outcome."""
+        """Number of stars of the batches by spacecraft, live or not, and outcome."""
 
     def add(
         self, unsaved_results: Sequence[UnsavedResult], outcomes: Sequence[WriteOutcome]

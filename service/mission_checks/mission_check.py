@@ -25,7 +25,7 @@ FEW_STARS = 3
 FEW_SHARE = 0.05
 MANY_STARS = 100
 MANY_PAIRS = 300_000
-"""Greatest number of pairs in one zone: 5 MB of memory, all searched for each batch."""
+"""Number of pairs in a zone above which a check reports it: 5 MB, searched for each batch."""
 SIGMAS_ARCSEC = 0.1, 120.0
 SAME_BORESIGHT_DEG = 0.1
 COELEVATION_DEG = 0.5

@@ -94,7 +94,7 @@ _HEADERS: Mapping[int, Any] = {
     503: {"headers": _RETRY_AFTER},
 }
 AUTH_STATUSES = (401, 403, 429)
-"""Statuses of every route that requires a token."""
+"""HTTP error statuses of every route that requires a token."""
 EVENT_STREAM = "text/event-stream"
 
 _REQUESTS: set[type[BaseModel]] = set()

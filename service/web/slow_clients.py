@@ -319,7 +319,7 @@ class _Http(HttpToolsProtocol):
     _section_bytes = _fields = 0
     """Size in bytes and number of fields of the head or trailers that the parser has reported."""
     _head_bytes = 0
-    """Bytes read, with up to `READ_BYTES` before them: the parser reports whole fields."""
+    """Number of bytes read for a head, with up to `READ_BYTES` from before it."""
     _body_bytes = _framing_bytes = 0
 
     # ---- the connection ------------------------------------------------------------------------
@@ -577,4 +577,4 @@ RAW_RESPONSES = {
         ),
     )
 }
-"""Complete raw responses by status."""
+"""Complete HTTP responses as bytes, by status, that need no running app."""

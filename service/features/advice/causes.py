@@ -42,7 +42,7 @@ SURROUNDINGS_DEG = 10.0
 RADIAL_MEDIAN = 1.1774
 """Ratio of the median radial error to the standard deviation per axis, for Gaussian errors."""
 NOISY, DENSER, FEWER, FAR = 1.5, 1.4, 0.75, 1.5
-"""Ratios to the earlier period beyond which noise, density, star numbers or angles differ."""
+"""Ratios to the earlier period at which noise, density, star numbers or angles count as changed."""
 BRIGHTER_MAG, OFFSET_MAG = 0.4, 0.25
 FITTING_SHARE = 0.6
 """Least share of a batch's stars with a catalog star nearby if its attitude is right."""

@@ -59,7 +59,7 @@ GROUPINGS: dict[Grouping, str] = {
     "spacecraft": "one spacecraft",
 }
 BEFORE_S, AFTER_S = 1800.0, 1800.0
-"""Seconds before and after the raise of an alarm that links from its page cover."""
+"""Seconds before and after the raise of an alarm that links from its page select."""
 TREND_BEFORE_S = 4 * 3600.0
 TOGETHER_S = 1800.0
 """Seconds within which alarms that leave their limits are assumed to share a cause."""

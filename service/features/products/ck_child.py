@@ -15,8 +15,8 @@ from collections.abc import Iterator
 import numpy as np
 
 IN_SEGMENT = 50_000
-"""Greatest number of records in a segment.  A longer interval continues in the next segment with
-its last record repeated, so that the step between both is not lost.
+"""Greatest number of records in a segment of a C-kernel. A longer interval continues in the next
+segment with its last record repeated, so that the step between both is not lost.
 """
 
 CLOCK_ZERO_S = -883_656_000

@@ -185,7 +185,7 @@ def _carried(
 
 LEAST_POINTS = 4
 REACH = 3
-"""Greatest number of batches from the first point of a seed to the second."""
+"""Greatest number of batches between the two points with which a search for a motion starts."""
 MOST_EXPECTED = 1e-4
 MOST_SEEDS = 3_000_000
 MOST_RATE_RAD_PER_S = 120.0 / ARCSEC_PER_RADIAN

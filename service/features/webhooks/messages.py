@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 
 TEST_KIND = "test"
 TOTAL_S = 10.0
-"""Time limit of an attempt in seconds, from name look-up to the end of the answer."""
+"""Time limit of a delivery attempt in seconds, from name look-up to the end of the answer."""
 GONE, TOO_MANY, UNAVAILABLE = 410, 429, 503
 
 

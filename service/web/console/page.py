@@ -185,7 +185,7 @@ class Layout:
     alarms: AlarmCounts | None = None
     """Alarms of the run, for the count on every page; None for a page without a run."""
     behind_s: float = 0.0
-    """Lag of trends and alarms behind the record, if waiting for them took too long."""
+    """Lag of trends and alarms behind the record, in seconds, if the wait for them was too long."""
 
     @property
     def is_live(self) -> bool:

@@ -224,7 +224,7 @@ class Metrics:
         build.info({"version": __version__})
         gauges = _GaugeCollector(app)
         self.close = gauges.close
-        """Ends the threads that read gauges; to be called after the last scrape."""
+        """Function that ends the threads which read gauges, to be called after the last scrape."""
         self.registry.register(gauges)
         self._counts, self._counted = app.submissions.counts, RecordedCounts()
         self._counting = threading.Lock()

@@ -12,7 +12,7 @@ from service.web.console.charts.panels import HEIGHT, WIDTH, Mask, Scale, TimeAx
 
 AXES = ("x", "y", "z")
 LARGEST_STEP_S = 600.0
-"""Greatest time between the two attitudes from which a rate is computed."""
+"""Greatest time in seconds between two attitudes from which a rate is computed."""
 GAP = 3.0
 """Greatest time between joined attitudes, as a multiple of their median time."""
 LEAST_BAND = 1.5

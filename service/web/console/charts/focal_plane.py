@@ -14,7 +14,7 @@ CELLS = 8
 LEAST_STARS = 5
 """Least number of stars in a cell whose mean residual gets an arrow."""
 LONGEST = 1.1
-"""Length of the longest arrow, in cells."""
+"""Length of the longest arrow of a residual map, in cells."""
 CLEAR = 3.3
 """Least clear mean residual in standard errors; without distortion one cell in 300 has it."""
 STEPS = (1.25, 1.5, 2.0, 3.0)

@@ -26,7 +26,7 @@ from service.web.requests.access import Policy
 LEAST_FREE = 0.1
 """Free part of the disk, and of the memory, below which the page warns."""
 MEMORY, OWN_MEMORY = Path("/proc/meminfo"), Path("/proc/self/statm")
-"""Files that exist on Linux only; elsewhere the page has no line about memory."""
+"""Paths of files on memory, on Linux only; elsewhere the page has no line about memory."""
 SLOW_QUEUE_S = 5.0
 ENDS_SOON_S = 30 * 86_400.0
 
