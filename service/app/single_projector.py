@@ -48,7 +48,7 @@ def _interrupt_replays(connection: Connection, now: str, ids: set[str]) -> None:
 
 
 class SingleProjector:
-    """State of the choice: True if this process projects; `start` competes for the lock.
+    """Competition for the role of projector, which one service on a database has at a time.
 
     A process without the lock of `Store` always projects: on SQLite, and a command.
     """

@@ -131,7 +131,7 @@ class SubmissionService:
     async def answered_each(
         self, read: Sequence[Submission | BadBatch], caller: Caller | None = None
     ) -> list[Outcome]:
-        """Submit each batch of an array; the answers and errors in order."""
+        """Submit each batch of an array; returns the answers and errors in order."""
         loop = asyncio.get_running_loop()
         futures: list[asyncio.Future[Answered]] = []
         for each in read:

@@ -43,7 +43,7 @@ class Closable(Protocol):
 
 
 class Client:
-    """Connections of one client address."""
+    """Counts of the connections of one client address, and those that are idle."""
 
     def __init__(self, origin: str, local: bool, shared: bool) -> None:
         self.origin = origin

@@ -13,7 +13,7 @@ from service.web.console.charts.panels import HEIGHT, WIDTH, Mask, Scale, TimeAx
 
 @dataclass(frozen=True)
 class ChartPanel:
-    """Chart of one axis; `marks` show rejected values, clipped to the edge."""
+    """Panel of a chart for one axis; `marks` show rejected values, clipped to the edge."""
 
     axis: str
     traces: tuple[Trace, ...]

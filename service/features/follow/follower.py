@@ -76,7 +76,7 @@ class NotNow(Exception):
 
 
 class Refused(Exception):
-    """Raised if the service refuses a message."""
+    """Raised if the service refuses a message, or fails at it."""
 
     def __init__(self, problem: Mapping[str, Any], has_failed: bool) -> None:
         """Keep the problem; `has_failed`: the service is at fault, another attempt may succeed."""

@@ -121,7 +121,7 @@ def range_s(text: str) -> int:
 
 @dataclass(frozen=True)
 class ShownPeriod:
-    """Shown period; `range` is None if the address has explicit bounds."""
+    """Period shown on a page; `range` is None if the address has explicit bounds."""
 
     range: str | None
     start: Utc
