@@ -32,7 +32,7 @@ TEST_OF_TOLERANCE = {
     "pole_angle_deg": "pole",
     "fov_rotation_deg": "fov_rotation",
 }
-"""The test that uses each tolerance; without the test the tolerance has no effect."""
+"""The test to which each tolerance belongs; while the test is off the tolerance has no effect."""
 
 
 def idle_reason(name: str, identifier: str, tests: Tests, zone: Cap | Band) -> str | None:
@@ -155,7 +155,7 @@ def refuse_idle_options(
 
 
 def impossible_tests(batch: ObservationBatch, mission: Mission) -> tuple[str, ...]:
-    """The tests that the kind of prior or the kind of zone makes impossible."""
+    """Names of the tests that the kind of prior or the kind of zone makes impossible."""
     in_band = isinstance(mission.zone, Band) and not isinstance(batch.a_priori, PredictedPrior)
     pole = () if in_band else ("pole",)
     return pole + (TESTS_OF_ROLL if isinstance(batch.a_priori, BoresightPrior) else ())

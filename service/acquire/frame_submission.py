@@ -41,7 +41,7 @@ def submit_frame(
     catalog: Catalog,
     max_pixels: int,
 ) -> Submission:
-    """The batch of the stars on a frame; for an uncalibrated camera the lens is fitted first.
+    """The submission of the stars on a frame; for an uncalibrated camera the lens is fitted first.
 
     Raises `BadFile` for a file that is no frame of the tracker and for a frame without a star,
     `BadInput` for data that do not fit the mission.
@@ -112,7 +112,7 @@ def _without_time(frame: Frame) -> Frame:
 
 
 def _chosen(result: PictureResult, most: int, limit_mag: float) -> list[int]:
-    """The points for the batch: those with a star in the run catalog first, then the others.
+    """Indices of the points for a batch: those with a star in the run catalog first, then others.
 
     Points with fainter stars are left out, since the mission's catalog does not have them.
     """
@@ -130,7 +130,7 @@ def _chosen(result: PictureResult, most: int, limit_mag: float) -> list[int]:
 
 
 def _scale_of(found: PictureAttitude, directions: Vector, sigma_rad: Vector) -> float:
-    """The factor on star sigmas that makes the attitude as uncertain as the fitted lens allows."""
+    """Factor on star sigmas that makes the attitude as uncertain as the lens fit; at least 1."""
     outer = np.einsum("ni,nj->nij", directions, directions)
     information = ((np.eye(3) - outer) / sigma_rad[:, None, None] ** 2).sum(axis=0)
     alone = np.diag(np.linalg.inv(information))

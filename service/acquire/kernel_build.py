@@ -48,29 +48,29 @@ and with Python's default of 700 an eighth of the time is spent on collections.
 
 _CONTEXT = multiprocessing.get_context("spawn")
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-"""The signals that stop the service, which may reach its whole process group."""
+"""Stop signals of the service, which may reach its whole process group."""
 
 
 class _Share(NamedTuple):
     """The kernels that one child process compiles, in order; see `prewarm_kernels`."""
 
     zones: list[str]
-    """Names of identifiers that search zones."""
+    """Names of the identifiers with a zone whose kernels the child compiles."""
     whole_sky: list[str]
-    """Names of identifiers that search the whole sky."""
+    """Names of the identifiers of the whole sky whose kernels the child compiles."""
     beside_batches: bool
-    """True if kernels for other work are compiled too: features, pictures."""
+    """True if the child also compiles the kernels of features and of pictures."""
 
 
 class KernelBuild:
-    """A build of the kernels that are missing from this machine's cache."""
+    """Build of the compiled kernels that this machine's cache lacks, with its state."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._children: list[SpawnProcess] = []
         self._cancelled = False
         self.is_needed = not _is_complete()
-        """True until a build has succeeded: answers must not depend on what is compiled."""
+        """True until every kernel is compiled, since answers must not depend on what is."""
         self.zones_needed = self.is_needed
         """True until the kernels for batches with a zone are compiled."""
         self.whole_sky_needed = self.is_needed
@@ -183,7 +183,7 @@ def end_with_parent() -> None:
 
 
 def exit_after_parent() -> None:
-    """In a child process, exit when the parent has ended."""
+    """Let a child process exit as soon as its parent has ended."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     threading.Thread(target=_exit_after, args=(parent.sentinel,), daemon=True).start()
@@ -209,7 +209,7 @@ def _processors() -> int:
 
 
 def _shares(processors: int) -> list[_Share]:
-    """The kernels for each child process to compile.
+    """The kernels for each child process to compile, by the number of processors.
 
     The kernel that weighs hypotheses takes as long as most others together, and the whole sky needs
     it, too: the first child has saved it by then.
@@ -283,7 +283,7 @@ EVERY_S = 10.0
 
 @dataclass(frozen=True)
 class KernelProgress:
-    """Progress of compilation: the current step, and the completed share (0 to 1)."""
+    """Progress of compilation: what is compiled now, and the completed share (0 to 1)."""
 
     step: str
     share: float
@@ -297,7 +297,7 @@ class KernelProgress:
 
 
 def kernel_progress() -> KernelProgress:
-    """Progress of compilation into this process's kernel cache."""
+    """Progress of compilation, from the files in this process's kernel cache."""
     config: Any = numba.config
     files = []
     for path in Path(config.CACHE_DIR).glob("*/*.nbc"):

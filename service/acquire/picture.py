@@ -62,9 +62,9 @@ GUESS_SHARE = 0.25
 REFINED_POINTS = 200
 LEAST_SIDE_PX = 100
 MIDDLE_SHARES = (1.0 / 3.0, 0.5, 0.25)
-"""Parts of a wide picture's sides whose middle is solved alone."""
+"""Shares of a wide picture's sides whose middle is solved by itself."""
 CHANGED_TRIALS = 16
-"""Largest number of trials with changed versions of one picture: parts, mirrors, focal lengths."""
+"""Number of changed versions of a picture that may be tried, by which odds are judged."""
 LEAST_FAR_SHARE = 0.5
 """Least share of points with a star far from the middle, over that share near the middle."""
 MOST_SIGMA_SHARE = 1.0 / 400.0
@@ -85,7 +85,7 @@ class PictureStar:
     id: str
     name: str | None
     row: int
-    """The row of the star in the list of bright stars."""
+    """The row of the star in the list of bright stars of the search."""
     magnitude_v_mag: float
     u_px: float
     v_px: float
@@ -123,7 +123,7 @@ class PictureAttitude:
 
     @property
     def lens_attitude(self) -> Matrix:
-        """The attitude (3, 3) whose z is the optical axis of the lens."""
+        """The attitude matrix (3, 3) of axes whose z is the optical axis of the lens."""
         return np.asarray(_of_the_middle(self.lens, np.eye(3)).T @ self.attitude)
 
     @cached_property
@@ -261,7 +261,7 @@ def solve_picture(
 def _solved_part(
     frame: Frame, sky: BrightStars, solver: BlindSolver, guess_px: float | None
 ) -> PictureResult:
-    """The result for a changed picture; `guess_px` is a focal length known to within a quarter."""
+    """The result for a part of a picture, or for changed pixels; `guess_px` is a focal length."""
     points = find_points(frame.counts)
     focal = FocalRange.of_fields(max(frame.counts.shape), WIDEST_FIELD_DEG)
     if guess_px is not None:
@@ -303,8 +303,7 @@ def _from_middle(
     guess_px: float | None,
     projections: Sequence[Projection],
 ) -> PictureResult | None:
-    """The result for a wide picture from its middle, which looks like that of a plain lens, or
-    None.
+    """Result for a wide picture, found by solving its middle first; None if that fails.
 
     The middle has the direction and the roll of the whole picture. From its attitude, which needs
     sufficient evidence, the lens of the whole is searched. If none of several projections fits, the
@@ -342,7 +341,7 @@ def _fits_far_out(found: Verified, places: Points) -> bool:
 
 
 def _middle_of(frame: Frame, share: float) -> Frame:
-    """The middle of a picture, with a given share of its sides."""
+    """A frame cut to its middle, with a given share of its sides."""
     height, width = frame.counts.shape
     down, across = (round(0.5 * (1.0 - share) * side) for side in (height, width))
     return replace(frame, counts=frame.counts[down : height - down, across : width - across])
@@ -505,7 +504,7 @@ def _attitude(
 def _systematic(
     found: Verified, u_px: Vector, v_px: Vector, star: Vector, shared_px2: float
 ) -> Matrix:
-    """The covariance (3, 3) of attitude errors that more stars do not reduce, in rad²."""
+    """The covariance (3, 3) in rad² of attitude errors that more stars do not reduce."""
     lens = found.fit.lens
     middle_u, middle_v = _middle(lens)
     arm_px2 = float(np.mean((u_px - middle_u) ** 2 + (v_px - middle_v) ** 2))
@@ -540,7 +539,7 @@ def _middle(lens: Lens) -> tuple[float, float]:
 
 
 def _of_the_middle(lens: Lens, attitude: Matrix) -> Matrix:
-    """Attitude whose z axis goes through the middle of the picture, by the shortest rotation."""
+    """Rotate an attitude by the shortest way until its z axis goes through the picture's middle."""
     u, v = _middle(lens)
     x, y, z = lens.directions(np.array([u]), np.array([v]))[0].tolist()
     turn = np.array(
@@ -554,7 +553,7 @@ def _of_the_middle(lens: Lens, attitude: Matrix) -> Matrix:
 
 
 def _turns_of_the_middle(fit: LensFit) -> Matrix:
-    """Rotation (3, p) of the middle's attitude, in radians, per unit of each fitted parameter."""
+    """Rotation (3, p) in radians of the middle's attitude per unit of each lens parameter."""
     turns = np.zeros((3, fit.parameters))
     unmoved = _of_the_middle(fit.lens, fit.attitude)
     step = 1e-6

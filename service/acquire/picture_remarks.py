@@ -17,9 +17,7 @@ if TYPE_CHECKING:
     from service.acquire.picture import PictureResult
 
 CLEAR_RATIO, LEAST_CLEAR = 12.0, 25
-"""Least signal to noise of clear points, and their number, from which a failed solution suggests an
-unusual lens or pixels.
-"""
+"""Signal to noise and number of clear points from which a failure suggests an unusual lens."""
 
 CLIPPED_SHARE = 0.5
 BLURRED_PX = 3.5

@@ -57,7 +57,7 @@ from service.sky.ephemeris import sun_distance_au
 from service.sky.model import SkyModel
 
 SHORT_WORK = 100_000
-"""Work limit in units of a batch solved without waiting, about seven milliseconds."""
+"""Work units allowed to a batch whose answer must not wait, about seven milliseconds."""
 
 
 class ResultColumns(Struct, frozen=True, eq=False):
@@ -170,7 +170,7 @@ def acquire_many(
 def _search(
     batch: ObservationBatch, mission: Mission, sky: SkyModel, timer: StepTimer, budget: WorkBudget
 ) -> Search:
-    """The conditions of all searches for a batch's stars."""
+    """The common input of all searches for one batch's stars: prior, catalog, settings, limits."""
     time, a_priori = batch.time, batch.a_priori
     return Search(
         batch=batch,
@@ -191,7 +191,7 @@ def _search(
 def _continued(
     search: Search, corrected: tuple[CorrectedObservations, ...], zones: ZoneSearch, row: int
 ) -> Acquisition | Exception:
-    """Acquisition of a batch that needs more than a search in zones about its a priori attitude."""
+    """Acquisition, or its error, of a batch that needs more than zones about its prior."""
     search = replace(search, timer=search.timer.of_one())
     first = zones.result(row) if row in zones else None
     try:
@@ -207,7 +207,7 @@ def _composed(
     found: SearchResult,
     rival: RivalAttitude | None,
 ) -> Acquisition:
-    """The acquisition of a batch, composed of search results, with its warnings."""
+    """The acquisition of a batch, made from the results of its searches, with warnings."""
     batch, mission, prior = search.batch, search.mission, search.prior
     in_zones = found.in_zones
     solved = found.refusal if in_zones is None else in_zones.solved

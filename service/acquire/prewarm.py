@@ -23,7 +23,7 @@ from service.times import Utc, parse_utc
 from service.vectors import quaternion_from_matrix, rotate_about
 
 ORION = 84.0, -1.0
-"""Right ascension and declination in degrees of a field with many bright stars."""
+"""Right ascension and declination in degrees of a field with bright stars, for warming up."""
 BRIGHT_MAG = 4.0
 """Magnitude limit of the warm-up catalog: few stars suffice to compile every kernel."""
 BRIGHTEST_MAG = 3.0
@@ -135,7 +135,7 @@ def prewarm_kernels(
 
 
 def compile_beside_batches() -> None:
-    """Load or compile the kernels of features and of pictures."""
+    """Load or compile the kernels (compiled functions) of features and of the JPEG check."""
     for module in feature_modules("kernels", os.environ.get(SETTING, "")):
         module.compile_kernels()
     compile_walk()
@@ -144,7 +144,7 @@ def compile_beside_batches() -> None:
 def _prewarm_seldom(
     sky: SkyModel, mission: Mission, body: dict[str, Any], identifiers: Collection[str]
 ) -> None:
-    """Compile the kernels for two groups of stars, or for group votes and a misaligned tracker."""
+    """Compile the kernels for two groups of stars, and for group votes of a misaligned tracker."""
     (seen,) = body["observations"]
     tracker, stars = mission.trackers[0], seen["stars"]
 

@@ -133,7 +133,7 @@ class Acquisition(Struct, frozen=True, eq=False, gc=False):
 
     @property
     def tracking_state(self) -> TrackingState | None:
-        """The tracking state of the spacecraft after a batch that asks for the last attitude.
+        """The tracking state after a batch, None unless the batch asks for the last attitude.
 
         A batch without an attitude counts as tracking if the prediction identified one of its
         stars.
@@ -235,11 +235,11 @@ NO_PREDICTION = {
 }
 NEAR_AXIS_COS = 0.9998
 FLIP_DEG = 5.0
-"""Rotation in degrees about the zone's axis above which a difference is called a roll."""
+"""Least rotation in degrees about the zone's axis that is called a roll in warnings."""
 
 
 def warnings_of_batch(batch: ObservationBatch, mission: Mission) -> list[str]:
-    """Warnings about the batch itself, independent of the result."""
+    """Warnings about the batch itself: its remarks, and options without effect."""
     warnings, options = list(batch.remarks), batch.options
     if options.tests or options.tolerances:
         off = [name for name in impossible_tests(batch, mission) if options.tests.get(name)]

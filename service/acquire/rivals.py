@@ -19,9 +19,9 @@ from service.observations.calibrate import CorrectedColumns, CorrectedObservatio
 from service.vectors import attitude_error_arcsec, read_only
 
 FEWEST_NAMED = 2
-"""Least number of identified stars of a second group in one tracker, for an attitude."""
+"""Least number of one tracker's stars that a second group must identify to have an attitude."""
 DIFFERENT_CHI_SQUARE = 30.0
-"""Chi-square (3 degrees of freedom) that the difference of equal attitudes exceeds in 1e-6."""
+"""Chi-square (3 degrees of freedom) of the difference of equal attitudes at probability 1e-6."""
 
 
 def find_groups(

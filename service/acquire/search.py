@@ -33,7 +33,7 @@ from service.vectors import (
 )
 
 CONTRADICTED_CHI_SQUARE = 30.0
-"""Chi-square (three degrees of freedom) that the error of a correct prediction exceeds in 1e-6."""
+"""Chi-square (3 degrees of freedom) of a correct prediction's error at probability 1e-6."""
 
 
 class SearchResult(Struct, frozen=True, eq=False, gc=False):
@@ -132,7 +132,7 @@ def find(
 
 
 def _presumed(search: Search, attitude: Matrix) -> PriorAttitude:
-    """The attitude found in the whole sky, in the form of a priori knowledge."""
+    """A whole-sky attitude in the form of a presumed one, for a search of zones about it."""
     prior = QuaternionPrior(read_only(quaternion_from_matrix(attitude)))
     if search.prior is not None and search.prior.predicted is not None:
         # The tests of the batch are those of a cap.
@@ -162,7 +162,7 @@ def _with_lone_stars(
     in_zones: ZoneResult,
     predicted: PredictedPrior,
 ) -> ZoneResult:
-    """A result in zones; without an attitude, completed by stars that the prediction identifies."""
+    """Complete a result in zones without an attitude by stars that the prediction identifies."""
     if isinstance(in_zones.solved, AttitudeSolution):
         return in_zones
     identifications = identify_lone_stars(
@@ -262,7 +262,7 @@ def identify_lone_stars(
     run_catalog: RunCatalog,
     inertial: Vector,
 ) -> list[Identification]:
-    """Identifications completed by the stars that a predicted attitude identifies by itself.
+    """Identifications completed by stars that a predicted attitude identifies, unless two are one.
 
     `attitude` (3, 3), inertial to body, is the predicted one with its covariance about the body
     axes; `inertial` (N, 3) are the apparent directions of the run catalog's stars. A star is unique

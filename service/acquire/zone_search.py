@@ -38,7 +38,7 @@ from service.vectors import Vector
 
 
 def as_row_error(error: Exception) -> Exception:
-    """An error in the form stored as the result of a row.
+    """The same error, made ready to be stored as the result of a row.
 
     Expected errors (`AcquisitionError`, `NotAtHand`) lose their traceback, which would keep all
     columns in memory.
@@ -48,7 +48,7 @@ def as_row_error(error: Exception) -> Exception:
 
 
 class StepTimer:
-    """The time spent in each step of the pipeline, summed, for one or more batches."""
+    """Timer of the pipeline's steps, with the sum of each for one or more batches."""
 
     def __init__(self, batches: int = 1) -> None:
         self.ns = dict.fromkeys(("zone", "identify", "solve"), 0)
@@ -60,7 +60,7 @@ class StepTimer:
         self._last = perf_counter_ns()
 
     def end(self, step: str) -> None:
-        """Add the time since the last call to a step."""
+        """Add the time since the last call, or the beginning, to a step of the pipeline."""
         now = perf_counter_ns()
         self.ns[step] += now - self._last
         self._last = now
@@ -78,7 +78,7 @@ class StepTimer:
 
 
 class Search(Struct, frozen=True, eq=False):
-    """The conditions of every search for the stars of one batch, or for a part of them."""
+    """Common input of every search for the stars of one batch, or for a part of them."""
 
     batch: ObservationBatch
     mission: Mission
@@ -93,7 +93,7 @@ class Search(Struct, frozen=True, eq=False):
 
     @property
     def identifier(self) -> IdentifierEntry:
-        """The registered identifier of the batch."""
+        """The registry's entry of the batch's identifier."""
         return IDENTIFIERS[self.choices.identifier]
 
     @property
@@ -129,7 +129,7 @@ class ZoneResult(Struct, frozen=True, eq=False):
 
 
 class _Asked(Struct, frozen=True, eq=False):
-    """The request of one row of a `ZoneSearch`: prior, search regions, and work limit."""
+    """Request of a zone search for one batch: presumed attitude, search regions, and work limit."""
 
     search: Search
     prior: PriorAttitude
@@ -164,11 +164,9 @@ class ZoneSearch:
         self.errors: dict[int, Exception] = {}
         self._asked: dict[int, _Asked] = {}
         self._by_itself: dict[int, Identification] = {}
-        """The results, by tracker, of identifiers that take one sighting at a time."""
+        """Identifications by tracker, from identifiers that take one sighting at a time."""
         self._zones: dict[tuple[int, *tuple[Hashable, ...]], list[tuple[int, int]]] = {}
-        """Lists of (row, tracker) that are identified in one call, by (index of the tracker in its
-        batch, identifier, rules, zone).
-        """
+        """Lists of (row, tracker) that are identified together, by the settings that they share."""
 
     def __contains__(self, row: int) -> bool:
         return row in self._asked
@@ -271,7 +269,7 @@ class ZoneSearch:
     def _sighting(
         self, t: int, asked: _Asked, index: int, zone: Zone, budget: WorkBudget
     ) -> Sighting:
-        """The input for an identifier that takes one sighting at a time."""
+        """The sighting of one tracker, for an identifier that takes one at a time."""
         seen, search, guide = self.seen, asked.search, None
         first, last = seen.offsets[t : t + 2]
         if search.identifier.needs_guide:
@@ -315,7 +313,7 @@ class ZoneSearch:
     # ---- results -----------------------------------------------------------------------------
 
     def final_rows(self) -> list[int]:
-        """The rows of batches that need no further search.
+        """The rows of batches whose result in zones is final, without any further search.
 
         They have a good attitude, or an identifier that never searches the whole sky, and too few
         stars left for a second group. A batch with a prediction is never final here, since its
@@ -335,7 +333,7 @@ class ZoneSearch:
         return final
 
     def result(self, row: int) -> ZoneResult:
-        """The result of the search for a row: identified stars and attitude."""
+        """The result of the search in zones for a row: identified stars, and attitude or reason."""
         asked, stars, trackers = self._asked[row], self.stars, self.stars.trackers_of(row)
         search = asked.search
         offsets = stars.star_offsets[trackers.start : trackers.stop + 1].tolist()

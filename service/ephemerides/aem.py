@@ -174,13 +174,13 @@ class _Reader(ccsds.MessageReader):
         )
 
     def _sequence(self, metadata: ccsds.Metadata, type: AttitudeType) -> str:
-        """Axes of the Euler angles, such as ZXZ; empty for a type without Euler angles."""
+        """Axes of the Euler angles in a segment, such as ZXZ; empty if its states have none."""
         if type.attitude != "euler" and "EULER_ROT_SEQ" not in metadata.values:
             return ""
         return ccsds.euler_sequence(metadata) if "euler" in (type.attitude, type.rates) else ""
 
     def _rate_in_body(self, metadata: ccsds.Metadata, from_body: bool) -> bool:
-        """True if the angular velocity has components about the body axes."""
+        """True if a segment's angular velocity has components about the body's axes."""
         name = next((each for each in _RATE_FRAMES if each in metadata.values), None)
         if name is None:
             return True
@@ -216,7 +216,7 @@ class _Reader(ccsds.MessageReader):
         return time_ns, tuple(numbers)
 
     def _named(self, token: ccsds.Token, form: _Form) -> tuple[str, ...]:
-        """Values of an XML state, in the order of a KVN state."""
+        """Values of a state in XML, brought into the order that a state in KVN has."""
         assert token.names is not None
         wanted = [("EPOCH",), *form.type.names(form.frames.sequence)]
         for name in set(token.names):
@@ -246,7 +246,7 @@ class _Reader(ccsds.MessageReader):
 
 
 def _unit_of(name: str) -> str:
-    """Unit of an XML element of a state."""
+    """Unit of an XML element of a state by its name, such as deg/s; empty for a pure number."""
     if name.startswith("Q"):
         return "1/s" if name.endswith("_DOT") else ""
     return next((unit for end, unit in _UNITS.items() if end in name.split("_")), "deg")

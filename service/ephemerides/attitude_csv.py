@@ -111,7 +111,7 @@ def _number(source: Source, line: int, row: dict[str, str], column: str) -> floa
 
 
 def _cells(source: Source, file: IO[bytes]) -> Iterator[tuple[int, list[str]]]:
-    """Cells of all lines that are not empty, with line numbers."""
+    """Line number and cells of each line of a CSV file that is not empty."""
     number = 0
     while data := file.readline(MAX_LINE_BYTES + 1):
         number += 1

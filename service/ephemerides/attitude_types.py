@@ -35,18 +35,18 @@ _AXES = np.eye(3)
 
 @dataclass(frozen=True)
 class AttitudeType:
-    """Representation of a state: the values of the attitude, followed by those of the rate."""
+    """Representation of a state by type: which attitude values, followed by which rates."""
 
     attitude: Attitude
     rates: Rates = "none"
 
     @property
     def size(self) -> int:
-        """Number of values in a state."""
+        """Number of values in a state of this type."""
         return _SIZES[self.attitude] + _RATE_SIZES[self.rates]
 
     def names(self, sequence: str) -> list[tuple[str, ...]]:
-        """Names of the XML elements of a state, in the order of a KVN state.
+        """Possible names of the XML elements of a state, in the order of a KVN state.
 
         Version 2 numbers Euler angles, version 1 names them after the axes of the `sequence`.
         """
@@ -107,7 +107,7 @@ def body_attitudes(
 
 
 def _components(q: Vector, vectors: Vector) -> Vector:
-    """Components (n, 3) of vectors after transforms by quaternions (n, 4)."""
+    """Components (n, 3) of vectors in the frames that quaternions (n, 4) turn into."""
     return np.asarray(np.einsum("nij,nj->ni", attitude_matrices(q), vectors))
 
 

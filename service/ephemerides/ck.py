@@ -24,7 +24,7 @@ from service.table_files.spool import PIECE_BYTES, folder
 from service.vectors import attitude_matrices
 
 CHILD_S = 600.0
-"""Time limit of the child process in seconds."""
+"""Time limit in seconds of the child process that reads a C-kernel."""
 MAX_UNPACKED_BYTES = 1 << 30
 _CHILD = Path(__file__).with_name("ck_reader_child.py")
 _UNPACKING = (

@@ -30,7 +30,7 @@ class Refused(Exception):
 
 
 def segments(handle: int) -> list[list[int]]:
-    """Segments of a CK: structure, frame, type, presence of rates, first and last address."""
+    """Segments of a C-kernel: structure, frame, type, presence of rates, first and last address."""
     spice.dafbfs(handle)
     found = []
     while spice.daffna():
@@ -39,7 +39,7 @@ def segments(handle: int) -> list[list[int]]:
 
 
 def records_of(handle: int, kind: int, begin: int, end: int, rates: int) -> "tuple[Floats, Floats]":
-    """Records (n, 8) of a segment, clock first, and the clock times at which intervals start."""
+    """Records (n, 8) of a C-kernel segment, clock first, and the starts of its intervals."""
     # The layouts of types 1 and 3 ("CK Required Reading"): packets, times, directory of times,
     # of type 3 starts of intervals, directory of starts, number of intervals; number of packets.
     size = 7 if rates else 4

@@ -62,7 +62,7 @@ def read_attitudes(file: Path, field: str) -> KnownAttitudes:
 
 @contextmanager
 def _opened(file: Path, field: str) -> Iterator[IO[bytes]]:
-    """Open a file, unpacking it if packed with gzip."""
+    """Context manager of an opened file, unpacked if packed with gzip."""
     try:
         with file.open("rb") as opened:
             is_packed = opened.read(3) == b"\x1f\x8b\x08"
@@ -86,7 +86,7 @@ def _require_text(file: Path, start: bytes, marks: tuple[bytes, ...], read: str)
 
 
 class _Truth(msgspec.Struct):
-    """Fields of a line of simulated truth that are read."""
+    """Line of simulated truth, with the fields that are read as an attitude."""
 
     spacecraft: str
     time: str

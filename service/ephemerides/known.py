@@ -18,9 +18,9 @@ MOST_RECORDS = 5_000_000
 """Greatest number of attitudes held in memory, 40 bytes each, or 64 with rates."""
 
 CLOCK_NS = 200
-"""Rounding error in nanoseconds of a time converted through a kernel's clock and ET."""
+"""Largest rounding error in nanoseconds of a time converted through a kernel's clock."""
 DISCRETE_NS = 1_000_000
-"""Nanoseconds from a record within which it applies, if nothing is known between records."""
+"""Nanoseconds about a record of a discrete segment for which its attitude holds."""
 
 STILL_RAD = 1e-5
 """Rotation in radians between records above which rates of zero count as missing."""
@@ -101,7 +101,7 @@ class KnownAttitudes:
         return sum(len(each.time_ns) for each in self.segments)
 
     def of_basis(self, bases: Sequence[str]) -> Self:
-        """Segments whose basis is one of `bases`."""
+        """The same attitudes, restricted to segments whose basis is one of `bases`."""
         return replace(self, segments=[each for each in self.segments if each.basis in bases])
 
     def at(self, time_ns: Integers, rate_rad_s: Vector | None = None) -> Vector:
@@ -117,7 +117,7 @@ class KnownAttitudes:
 
 
 def told_rates(quaternion: Vector, rate_rad_s: Vector | None) -> Vector | None:
-    """Rates (n, 3) of attitudes (n, 4); None if all are zero although the body turns."""
+    """Given rates (n, 3) of attitudes (n, 4); None if missing, or zero although the body turns."""
     if rate_rad_s is None or rate_rad_s.any() or len(quaternion) < 2:
         return rate_rad_s
     turned = np.linalg.norm(rotation_vectors(quaternion[:-1], quaternion[1:]), axis=1)
@@ -125,7 +125,7 @@ def told_rates(quaternion: Vector, rate_rad_s: Vector | None) -> Vector | None:
 
 
 def known_attitudes(file: str, object_name: str, segments: Sequence[Segment]) -> KnownAttitudes:
-    """Attitudes of a file with segments in order of time; see `in_order`."""
+    """The attitudes of a file, with its segments in order of time; raises `BadFile` for none."""
     if not segments:
         raise BadFile(Fault(file, "has no attitude"))
     return KnownAttitudes(object_name, in_order(file, segments))
@@ -135,7 +135,7 @@ S = TypeVar("S", bound=Span)
 
 
 def in_order(file: str, segments: Sequence[S]) -> list[S]:
-    """Sort the segments of a file by time.
+    """The segments of a file in order of time; raises `BadFile` if two overlap.
 
     Raises `BadFile` for a segment without useable time, and if two overlap.
     """
@@ -151,7 +151,7 @@ def in_order(file: str, segments: Sequence[S]) -> list[S]:
 
 
 def by_priority(segments: Sequence[Segment]) -> list[Segment]:
-    """Resolve overlaps of segments: at any time the last segment in the file has priority.
+    """Segments without overlap: at any time the last one in the file has priority.
 
     A discrete segment is unknown between its records, where earlier segments stay valid.
     """
@@ -226,7 +226,7 @@ class StateSegment(Span):
         return np.concatenate([position, velocity / unit_s])
 
     def _window(self, after: int, time_ns: int) -> slice:
-        """Slice of the states that the polynomial passes through, centred on the time.
+        """Slice of the states through which the interpolating polynomial passes, about a time.
 
         With an odd number the nearest state is in the middle; at the ends of the segment the window
         ends there too.
@@ -255,7 +255,7 @@ class KnownStates:
 
 
 def known_states(file: str, object_name: str, segments: Sequence[StateSegment]) -> KnownStates:
-    """Orbital states of a file with segments in order of time; see `in_order`."""
+    """The orbital states of a file, with segments in order of time; raises `BadFile` for none."""
     if not segments:
         raise BadFile(Fault(file, "has no state"))
     return KnownStates(object_name, in_order(file, segments))

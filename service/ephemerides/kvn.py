@@ -19,10 +19,10 @@ def kvn(pairs: Pairs) -> str:
 
 
 def time_text(utc: str) -> str:
-    """Time in a message: UTC without the Z, since a keyword names the time system."""
+    """UTC text without its Z, as CCSDS messages have it: a keyword names the time system."""
     return utc.removesuffix("Z")
 
 
 def one_line(text: str) -> str:
-    """Replace characters other than printable ASCII, so that a text fits on one line."""
+    """Replace all but printable ASCII in a text, so that it fits on one line."""
     return "".join(each if " " <= each <= "~" else "?" for each in text)

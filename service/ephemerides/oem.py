@@ -57,7 +57,7 @@ _NAMES = ("EPOCH", "X", "Y", "Z", "X_DOT", "Y_DOT", "Z_DOT")
 
 @dataclass
 class _Form:
-    """Layout of a segment's states from its metadata, with the states read so far."""
+    """Layout of an orbit segment by its metadata, with the states read so far."""
 
     line: int
     time_system: str
@@ -66,7 +66,7 @@ class _Form:
     method: Interpolation
     degree: int | None
     has_ended: bool = False
-    """True once covariances have begun, which follow the states."""
+    """True once the segment's covariances have begun, which follow its states."""
     times: list[int] = field(default_factory=list)
     states: list[list[float]] = field(default_factory=list)
 
@@ -158,7 +158,7 @@ class _Reader(ccsds.MessageReader):
         form.states.append(state)
 
     def _made(self, form: _Form, line: int) -> StateSegment:
-        """Segment from the states read; `line` is that of its last token."""
+        """Orbit segment made from the states read; `line` is that of its last token."""
         if not form.times:
             raise self._source.bad(form.line, "META_STOP", "begins a segment of no state")
         if form.times[0] > form.span_ns[0] + SHORT_NS:
@@ -180,7 +180,7 @@ class _Reader(ccsds.MessageReader):
         )
 
     def _check_steps(self, form: _Form) -> None:
-        """Refuse states too far apart, measured by the period of a circular orbit there."""
+        """Raise `BadFile` for states too far apart, in periods of a circular orbit there."""
         step_s = np.diff(np.array(form.times)) * 1e-9
         radius_km = np.linalg.norm(np.array(form.states)[:, :3], axis=1)
         lower_km = np.minimum(radius_km[:-1], radius_km[1:])

@@ -36,7 +36,7 @@ _NUMBERS: dict[str, tuple[float, float, float | None]] = {
     "MEAN_MOTION_DOT": (-10.0, 10.0, 0.0),
     "MEAN_MOTION_DDOT": (-10.0, 10.0, 0.0),
 }
-"""Range of each element, in revolutions per day or degrees, and its default; None: required."""
+"""Range of each mean element, in revolutions per day or degrees, and its default."""
 _FIXED = {
     "CENTER_NAME": ("EARTH",),
     "REF_FRAME": ("TEME",),
@@ -44,9 +44,7 @@ _FIXED = {
     "MEAN_ELEMENT_THEORY": ("SGP4", "SGP/SGP4", "SGP", "TLE"),
     "EPHEMERIS_TYPE": ("0", "2"),
 }
-"""Accepted values of the keywords that define the meaning of the elements; JSON and CSV catalogs
-omit most of these keywords.
-"""
+"""Accepted values of the keywords that define the meaning of the mean elements."""
 _JD_OF_1950 = 2433281.5
 """Julian date of day 0 of 1950, from which SGP4 counts days."""
 _BEYOND_NS = re.compile(r"(\.\d{9})\d+")
@@ -59,7 +57,7 @@ def is_omm(start: bytes) -> bool:
 
 
 def read_omm(name: str, file: IO[bytes], field: str) -> TleEphemeris:
-    """Read the element sets of a file about one object.
+    """Read the mean element sets of a file about one object, for SGP4.
 
     Raises `BadFile` naming file, line and field, and `NotAvailable` without sgp4.
     """
@@ -83,7 +81,7 @@ def read_omm(name: str, file: IO[bytes], field: str) -> TleEphemeris:
 
 
 def _sets_of_fields(source: ccsds.Source, file: IO[bytes]) -> Iterator[Fields]:
-    """Keywords and values of each element set, with a line number."""
+    """Keywords and values of each element set in a file, after its line number."""
     start = file.read(256).lstrip(codecs.BOM_UTF8 + b" \t\r\n")
     file.seek(0)
     if start.startswith((b"<", b"CCSDS_")):

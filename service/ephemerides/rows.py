@@ -50,10 +50,10 @@ class AttitudeRows:
         return len(self.time_ns)
 
     def taken(self, places: Any) -> Self:
-        """Rows selected by indices or a mask."""
+        """Table of the rows at given indices, or in a mask."""
         return replace(self, **{f.name: getattr(self, f.name)[places] for f in fields(self)})
 
     def followed_by(self, other: Self) -> Self:
-        """Concatenate with the rows of another table."""
+        """Table with the rows of another one after its own."""
         pairs = {f.name: (getattr(self, f.name), getattr(other, f.name)) for f in fields(self)}
         return replace(self, **{name: np.concatenate(pair) for name, pair in pairs.items()})

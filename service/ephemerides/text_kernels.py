@@ -26,6 +26,6 @@ def leap_second_kernel() -> str:
 
 
 def text_kernel(kind: str, about: str, *lines: str) -> str:
-    """Text kernel of a kind, such as `LSK`, with a comment line and its data."""
+    """Text of a SPICE kernel of a kind, such as `LSK`, with a comment line and its data."""
     body = "\n".join(lines)
     return f"KPL/{kind}\n\n{about}\n\n\\begindata\n\n{body}\n\n\\begintext\n"

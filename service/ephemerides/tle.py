@@ -26,7 +26,7 @@ MAX_AGE_D = 7.0
 MOST_SETS = 100_000
 MAX_LINE_BYTES = 200
 _FIRST_CENTURY_YEAR = 57
-"""First two-digit year of the 1900s in an element set; a smaller one is in the 2000s."""
+"""First two-digit year of an element set that is in the 1900s; smaller ones are in the 2000s."""
 
 _NUMBER, _ANGLE = r" *\d+|[A-HJ-NP-Z]\d{4}", r" *\d+\.\d{4}"
 _EXPONENT = r"[ +-]\d{5}[+-]\d"
@@ -52,9 +52,9 @@ _FIELDS: dict[int, tuple[tuple[str, int, int, str], ...]] = {
         ("revolution number", 63, 68, r" *\d*"),
     ),
 }
-"""Fields of a TLE line: name, first column, end column (both from 0), and pattern."""
+"""Fields of each TLE line: name, first column, end column (both from 0), and pattern."""
 _SPACES = {1: (1, 8, 17, 32, 43, 52, 61, 63), 2: (1, 7, 16, 25, 33, 42, 51)}
-"""Columns of blanks between the fields of a TLE line."""
+"""Columns of each TLE line, from 0, that must be blank."""
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ def read_tle(name: str, file: IO[bytes], field: str) -> TleEphemeris:
 
 
 def _lines(source: Source, file: IO[bytes]) -> Any:
-    """Lines that are not empty, with their numbers."""
+    """Lines of a TLE file that are not empty, each after its number; raises `BadFile`."""
     number = 0
     while data := file.readline(MAX_LINE_BYTES + 1):
         number += 1
@@ -155,7 +155,7 @@ def _lines(source: Source, file: IO[bytes]) -> Any:
 
 
 def _check(source: Source, line: int, text: str, which: int) -> None:
-    """Raise `BadFile` unless a text is a valid first or second line of a set."""
+    """Raise `BadFile` unless a text is a valid first or second line of a two-line set."""
     if not text.startswith(f"{which} "):
         raise source.bad(line, f"line {which}", f"must begin with {which} and a space", text)
     if len(text) != LENGTH:

@@ -45,7 +45,7 @@ class Token:
 
 @dataclass(frozen=True)
 class MessageForm:
-    """Notation of a kind of CCSDS message.
+    """Notation of one kind of CCSDS message: marks, parts and states.
 
     In KVN `marks` stand alone in their lines, and lines without keyword are states after one of
     `before_states`.  In XML the elements `parts` replace the marks of start and end, and `state` is
@@ -80,17 +80,17 @@ OEM = MessageForm(
 
 @dataclass(frozen=True)
 class Source:
-    """An input file, identified by its name in messages."""
+    """Input file under the name that error messages have; it makes their errors."""
 
     name: str
 
     def bad(self, line: int, field: str, message: str, value: object = None) -> BadFile:
-        """Error that names file, line and field."""
+        """Error `BadFile` that names file, line and field, with a message and a value."""
         shown = None if value is None else shown_value(value)
         return BadFile(Fault(f"{self.name}, line {line}: {field}", message, shown))
 
     def bad_token(self, token: Token, message: str) -> BadFile:
-        """Error that names a token and its line."""
+        """Error `BadFile` that names a token and its line."""
         return self.bad(token.line, token.name, message, token.value or None)
 
     def epoch_ns(self, token: Token, word: str, time_system: str) -> int:
@@ -173,7 +173,7 @@ def _xml(source: Source, file: IO[bytes], form: MessageForm) -> Iterator[Token]:
 
 
 class _XmlReader:
-    """Collects tokens of an XML message; expands no entity and fetches nothing."""
+    """Parser that collects the tokens of an XML message; expands no entity and fetches nothing."""
 
     def __init__(self, source: Source, form: MessageForm) -> None:
         self._source, self._form = source, form
@@ -193,14 +193,14 @@ class _XmlReader:
         self._attributes: dict[str, str] = {}
 
     def feed(self, piece: bytes) -> None:
-        """Parse the next piece; an empty one marks the end."""
+        """Parse the next piece of an XML message; an empty one marks the end."""
         try:
             self._parser.Parse(piece, not piece)
         except expat.ExpatError as error:
             raise self._source.bad(error.lineno, "XML", expat.ErrorString(error.code)) from None
 
     def taken(self) -> list[Token]:
-        """Tokens completed since the last call."""
+        """Tokens of an XML message completed since the last call."""
         tokens, self._tokens = self._tokens, []
         return tokens
 
@@ -274,7 +274,7 @@ class _XmlReader:
 
 
 _LESS_TAI_NS = {"TAI": 0, "GPS": -19 * 10**9, "TT": 32_184_000_000}
-"""Offsets of uniform time systems from TAI, in nanoseconds."""
+"""Nanoseconds by which each uniform time system is ahead of TAI, by name."""
 TIME_SYSTEMS = ("UTC", *_LESS_TAI_NS)
 _J2000 = datetime(2000, 1, 1, 12)
 _DECIMALS = re.compile(r"(.*T\d\d:\d\d:\d\d)(\.\d+)?Z?", re.ASCII)
@@ -326,7 +326,7 @@ class Metadata:
                 raise self.source.bad(self.line, name, "is missing in the metadata")
 
     def one_of(self, name: str, known: tuple[str, ...]) -> str:
-        """Upper-case value of a keyword; raises `BadFile` unless it is a known one."""
+        """Upper-case value of a metadata keyword; raises `BadFile` unless it is one of `known`."""
         value = self.values[name].upper()
         if value not in known:
             raise self.fault(name, f"must be one of {', '.join(known)}")
@@ -361,7 +361,7 @@ class Metadata:
         return first, last
 
     def fault(self, name: str, message: str) -> BadFile:
-        """Error that names a keyword with its line and value."""
+        """Error `BadFile` that names a metadata keyword with its line and value."""
         return self.source.bad(self.lines[name], name, message, self.values[name])
 
 
@@ -430,7 +430,7 @@ def read_version(
 
 
 class MessageReader:
-    """Checks shared by readers of messages: one object, ascending times, number of states."""
+    """Base class of message readers, which checks objects, times and the number of states."""
 
     def __init__(self, source: Source) -> None:
         self._source = source

@@ -36,7 +36,7 @@ from service.vectors import (
 
 POLE_FROM_SUN_WARNING_DEG = 1.0
 SUN_FROM_EARTH_GROWTH_DEG = 0.3
-"""Zone margin in degrees for the Sun seen from Earth's centre instead of L1, up to 0.26 deg."""
+"""Growth of a zone in degrees for a Sun direction seen from Earth's centre instead of L1."""
 SAME_BORESIGHT_DEG = 0.01
 PARALLEL_COS = 0.999999
 """Cosine from which two directions are too parallel to define a plane."""
@@ -139,7 +139,7 @@ def _sun_pointed(prior: SunPointedPrior, time: Utc, mission: Mission) -> PriorAt
 
 
 def _frame(first: Vector, second: Vector) -> Matrix:
-    """A right-handed frame as rows: a direction, its normal with a second one, the third axis.
+    """A right-handed frame as rows: a direction, its normal with a second one, and the third axis.
 
     A second direction parallel to the first is replaced by a coordinate axis.
     """
@@ -164,7 +164,7 @@ def _pole_warnings(pole: Vector, time: Utc, position_km: Vector | None) -> tuple
 def search_region(
     tracker: Tracker, presumed: PriorAttitude, mission: Mission, field_name: str
 ) -> SearchRegion:
-    """The region of the sky in which a tracker's stars are searched.
+    """The region of the sky in which one tracker's stars are searched.
 
     For a cap mission the region is centred on the tracker's presumed boresight; for a band mission
     it is at the boresight's coelevation from the pole, corrected for a measured pole. For a
@@ -205,7 +205,7 @@ def search_region(
 def _pole_shift_deg(
     tracker: Tracker, presumed: PriorAttitude, mission: Mission
 ) -> tuple[float, float]:
-    """Bounds on the change of a boresight's coelevation by a measured pole, in degrees.
+    """Bounds in degrees on the shift of a boresight's coelevation by a measured pole.
 
     They are rounded to the zone's grid, so that zones are reused while the pole moves a little.
     """

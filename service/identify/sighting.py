@@ -109,13 +109,13 @@ class SightingColumns(NamedTuple):
     left: Any
 
     def set_region(self, s: int, region: SearchRegion) -> None:
-        """Set the search region of a sighting; its relation to a zone is set by `set_zone`."""
+        """Set a sighting's columns of its search region, apart from those that `set_zone` sets."""
         self.axis[s], self.is_band[s] = region.axis, region.kind == "band"
         self.least[s] = math.radians(region.least_deg)
         self.most[s] = math.radians(region.most_deg)
 
     def set_zone(self, s: int, region: SearchRegion, zone: Zone) -> None:
-        """Set the relation of a sighting's region to the zone that serves it."""
+        """Set how a sighting's search region lies within the zone that serves it."""
         self.all_inside[s] = zone.serves_exactly(region)
         # Only bands store angles to the axis.
         if self.is_band[s] and not self.all_inside[s]:
@@ -125,7 +125,7 @@ class SightingColumns(NamedTuple):
 def room_for_sightings(
     offsets: Integers, sigma_rad: Vector, magnitude_mag: Vector
 ) -> SightingColumns:
-    """Columns for sightings of given stars; all other values are to be filled in."""
+    """Columns for sightings of given stars, whose other values are still to be filled in."""
     k, m = len(offsets) - 1, len(sigma_rad)
     boresight, velocity, prior_axis, axis = np.zeros((4, k, 3))
     least, most, off_axis = np.zeros((3, k))

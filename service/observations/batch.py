@@ -150,4 +150,4 @@ class ObservationBatch(Struct, frozen=True, eq=False):
     tracking: Tracking | None = None
     measurement: MeasuredAttitude | None = None
     remarks: tuple[str, ...] = ()
-    """Notes on values interpreted otherwise than sent: a code, a colon and a sentence each."""
+    """Notes on values taken otherwise than sent: a code, a colon and a sentence each."""

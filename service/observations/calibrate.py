@@ -88,7 +88,7 @@ class CorrectedColumns(Struct, frozen=True, eq=False, gc=False):
 
 
 def correct(batch: ObservationBatch, mission: Mission) -> tuple[CorrectedObservations, ...]:
-    """The stars of a batch as unit vectors in body axes at its epoch, one object per tracker.
+    """The stars of a batch as unit vectors in body axes at its epoch, with one object per tracker.
 
     Raises `BadInput` naming the field of a tracker unknown to the mission, and the errors of
     `reduced`.
@@ -98,7 +98,7 @@ def correct(batch: ObservationBatch, mission: Mission) -> tuple[CorrectedObserva
 
 
 def trackers_of(batch: ObservationBatch, mission: Mission) -> list[Tracker]:
-    """The mission's trackers for a batch; raises `BadInput` naming the field of an unknown one."""
+    """The mission's trackers for those of a batch; raises `BadInput` with the field of another."""
     return [
         mission.tracker(each.tracker, f"observations.{index}.tracker")
         for index, each in enumerate(batch.observations)
@@ -154,7 +154,7 @@ def correct_columns(batches: BatchColumns, trackers: Sequence[Tracker | None]) -
 
 @njit
 def _to_body(tangents, rows, settings, observed, written):  # type: ignore[no-untyped-def]
-    """Rotate the stars of one tracker to body axes at the epoch of their batch.
+    """Fill in the stars of one tracker, rotated to body axes at the epochs of their batches.
 
     v(epoch) = exp([w x] dt) v, dt being the star's time minus the batch's.  A star without a
     vector has the direction (tan h, tan v, 1) in tracker axes; `tangents` (m, 2) are tan h, tan v.

@@ -46,17 +46,17 @@ VECTORS = {
 DIRECTION = ("x", "y", "z")
 STAR_NUMBERS = ("h_deg", "v_deg", "magnitude", "time_offset_s", "sigma_arcsec")
 READINGS = ("h_counts", "v_counts", "h_times", "v_times")
-"""Columns with the readings of a star of a scanning tracker: numbers separated by spaces."""
+"""CSV columns with a scanning tracker's readings of a star: numbers separated by spaces."""
 LINES = ("column_counts", "row_counts")
-"""Columns with the line sums of a raster tracker, in a row without a star."""
+"""CSV columns with the line sums of a raster, in a row without a star."""
 STAR_COLUMNS = ("tracker", *DIRECTION, *STAR_NUMBERS, *READINGS)
 PRIORS = ("sun_pointed", "sun_counts", "a_priori_from")
 BATCH_COLUMNS = (*TEXTS, *sum(VECTORS.values(), ()), *PRIORS, "options")
 COLUMNS = (*BATCH_COLUMNS, *STAR_COLUMNS, *LINES)
 MEASURED = ("measured_quaternion", "measured_sigma_arcsec", "measured_covariance_arcsec2")
-"""Columns of an attitude measured by a tracker itself, in a row without a star."""
+"""CSV columns of an attitude measured by a tracker itself, in a row without a star."""
 VERBATIM = (*TEXTS, "tracker")
-"""Columns whose cells keep their spaces; other cells are stripped."""
+"""CSV columns whose cells keep their spaces; all other cells are stripped."""
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?", re.ASCII)
 _D_TO_E = str.maketrans("dD", "ee")
@@ -70,7 +70,7 @@ class BadCell(Exception):
         self.value = None if value is None else shown_value(value)
 
     def fault(self, line: int) -> Fault:
-        """The error as a fault that names line and column."""
+        """The error of a CSV cell as a fault that names its line and column."""
         return Fault(f"line {line}, column {self.column}", self.message, self.value)
 
 
@@ -195,7 +195,7 @@ def _measurement(
 
 
 def star_of(row: CsvRow) -> dict[str, Any]:
-    """The star in a CSV row; raises `BadCell`."""
+    """The fields of the star in a CSV row, if it has any; raises `BadCell`."""
     star: dict[str, Any] = {name: number_cell(row, name) for name in STAR_NUMBERS if row.get(name)}
     star |= _numbers(row, READINGS)
     vector = _group(row, DIRECTION)
@@ -217,7 +217,7 @@ def _numbers(row: CsvRow, columns: tuple[str, ...]) -> dict[str, list[float]]:
 
 
 def number_cells(cells: Iterable[tuple[str, float]]) -> CsvRow:
-    """CSV cells for numbers, by column."""
+    """CSV cells by column for numbers, as the shortest text that gives the same number."""
     # repr gives the shortest text that is read back as the same number.
     return {column: repr(value) for column, value in cells}
 
@@ -230,7 +230,7 @@ def list_cells(model: schema.StarIn | schema.TrackerIn | schema.SunPointedIn) ->
 
 
 def batch_cells(batch: schema.BatchIn) -> CsvRow:
-    """The CSV cells of a checked batch that all of its rows share."""
+    """The CSV cells of a checked batch that are equal in all of its rows."""
     prior = batch.a_priori
     cells: CsvRow = {"spacecraft": batch.spacecraft, "batch": batch.batch, "run": batch.run}
     cells |= {"time": batch.time, "aberration": batch.aberration}
@@ -282,11 +282,11 @@ class JoinedRows(ABC):
     """A collector for the CSV rows of one batch or gyro block; a bad cell refuses all rows."""
 
     key_columns: ClassVar[tuple[str, ...]]
-    """The columns that identify a batch or block."""
+    """The CSV columns that identify a batch or gyro block."""
     may_lack: ClassVar[str]
-    """A message: what may be missing from a batch or block next to an unreadable row."""
+    """Text of a fault: what a batch or block may lack next to an unreadable row."""
     refuses_faulty_rows: ClassVar[bool]
-    """True if a faulty row refuses only rows of its own key; false if neighbouring rows, too."""
+    """True if a faulty row refuses only its own batch or block; false if neighbours, too."""
 
     def __init__(self, number: int, key: tuple[str, ...]) -> None:
         self.number, self.key = number, key
@@ -294,7 +294,7 @@ class JoinedRows(ABC):
         self.fault_at = number
 
     def add(self, number: int, row: CsvRow) -> None:
-        """Add a row with its line number in the file."""
+        """Add a CSV row with its line number in the file; a bad cell refuses all rows."""
         if self.fault is None:
             try:
                 self.take(row)

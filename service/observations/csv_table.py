@@ -37,11 +37,11 @@ CsvRow = dict[str, str]
 
 @dataclass(frozen=True)
 class RowKind:
-    """The columns of a kind of CSV file, and the key columns that identify a batch or block."""
+    """A kind of CSV file: its columns, and those that identify a batch or block."""
 
     noun: str
     key: tuple[str, str, str]
-    """The key columns: spacecraft, run and name; only the run may be empty."""
+    """The columns that identify a batch or block: spacecraft, run (may be empty) and name."""
     columns: Sequence[str]
     texts: frozenset[str]
     """Columns that hold text instead of numbers."""
@@ -50,7 +50,7 @@ class RowKind:
     check_header: Callable[[list[str], str], None]
     """A function that raises `BadFile` for wrong column names, given their location in the file."""
     ordered_by_time: bool
-    """True if scattered rows of one batch are sorted by time."""
+    """True if scattered rows of one batch or block are sorted by time."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class CsvTable:
     """A CSV file as rows by column; `kind` is the kind of file recognised by its header."""
 
     def __init__(self, stream: BinaryIO, kinds: Sequence[RowKind]) -> None:
-        """Scan a whole seekable file once.
+        """Scan a whole seekable CSV file once, for header, decimal mark and scattered rows.
 
         Raises `BadFile` for the header, for decimal commas beside decimal points, and for scattered
         rows that cannot be grouped by batch.
@@ -111,7 +111,7 @@ class CsvTable:
                 yield row
 
     def _header(self, kinds: Sequence[RowKind]) -> list[str]:
-        """The column names, after comment lines with `#`; also determines the separator."""
+        """The column names in a header, after comment lines with `#`; also finds the separator."""
         lines = (
             line for line in physical_lines(self._stream) if not (line.body or b"").startswith(b"#")
         )
@@ -150,7 +150,7 @@ class CsvTable:
             yield replace(line, number=place.number)
 
     def _cells(self, line: Line) -> list[str] | Fault:
-        """The cells of a line; an empty list for an empty row or a repeated header."""
+        """Cells of a CSV line, none for an empty one or a repeated header; or the line's fault."""
         if line.body is None:
             return line.fault or Fault(f"line {line.number}", "cannot be read")
         found = _split(line.body, self._separator)
@@ -200,7 +200,7 @@ class CsvTable:
         return Row(line.number, cells, fault)
 
     def _survey(self) -> int | None:
-        """Scan all rows; returns the first line whose batch also occurred earlier in the file."""
+        """Scan all rows; returns the first line whose batch also occurred earlier, or None."""
         keys, firsts = array("q"), array("Q")
         marks: dict[str, int] = {}
         last = None
@@ -238,7 +238,7 @@ class CsvTable:
         return int(firsts[int(np.argmax(again))]) if again.any() else None
 
     def _together(self, apart: int) -> Iterator[_Place]:
-        """The locations of all rows, grouped by batch, with batches in order of time."""
+        """The locations of all rows, grouped by batch, with the batches in order of time."""
         keys, times_ns, offsets, numbers = array("q"), array("q"), array("Q"), array("Q")
         noun = self.kind.noun
         time = self._names.index("time")
@@ -282,7 +282,7 @@ def _order(
 
 
 def _time_ns(text: str) -> int:
-    """The time of a row in TAI nanoseconds; 0 for an unreadable time, which is refused later."""
+    """The time of a CSV row in TAI nanoseconds; 0 for an unreadable one, which is refused later."""
     try:
         return parse_utc(_with_point(text.strip())).tai_ns
     except BadInput:

@@ -35,7 +35,7 @@ _NO_VECTOR: Final = (_ABSENT, _ABSENT, _ABSENT)
 
 
 class _SentPart(msgspec.Struct, forbid_unknown_fields=True, gc=False):
-    """A JSON object of a canonical batch; absent fields have the same defaults as in `schema`."""
+    """Base class of the JSON objects in a canonical batch, with the defaults of `schema`."""
 
 
 class SentStar(_SentPart):
@@ -70,7 +70,7 @@ class SentDirection(_SentPart):
 
 
 class SentPrediction(_SentPart):
-    """The attitude prediction that a batch was recorded with."""
+    """The prediction of an attitude that a batch was recorded with, or the reason for none."""
 
     quaternion: tuple[float, float, float, float] | None = None
     covariance_arcsec2: tuple[Triple, Triple, Triple] | None = None
@@ -168,7 +168,7 @@ def batch_from_canonical(text: str) -> ObservationBatch:
 
 
 def prior_from_canonical(text: str) -> APriori | None:
-    """A priori knowledge without a batch, decoded from its canonical JSON."""
+    """A priori knowledge without a batch, decoded from canonical JSON; None for the last one."""
     return _prior_of(_PRIOR.decode(text), None, None)
 
 
@@ -286,4 +286,4 @@ class _Rates(msgspec.Struct):
 
 
 RECORDED_RATES = msgspec.json.Decoder(_Rates)
-"""A decoder of the body rates in a recorded batch; None for a batch without rates."""
+"""A JSON decoder of a recorded batch's body rates alone, None where there are none."""

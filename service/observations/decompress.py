@@ -19,9 +19,9 @@ MAX_WINDOW_BYTES = 128 << 20
 
 
 MAX_RATIO = 200
-"""Largest compression ratio: telemetry reaches 10, a simulation with repeated stars 100."""
+"""Largest ratio of decompressed to compressed size of a body of telemetry."""
 FREE_BYTES = 256 << 20
-"""Size up to which a body may decompress whatever its ratio; read in seconds."""
+"""Size in bytes up to which a body may decompress at any ratio, since it is read in seconds."""
 
 
 def unpacked_lines(
@@ -160,7 +160,7 @@ MAX_LINE_BYTES = 1 << 20
 
 @dataclass(frozen=True)
 class Line:
-    """A line of telemetry: a batch or gyro block as JSON, or the fault found instead.
+    """A line of telemetry: a batch or gyro block as JSON, or the fault in its place.
 
     `number` counts lines from one; a batch from a CSV file has the number of its first row, a fault
     the number of its own line.

@@ -21,7 +21,7 @@ EXPLAINED = 3
 PRIOR_KINDS = {each: each for each in ("quaternion", "boresight", "sun_pointed")} | {
     "from_last": "from"
 }
-"""The kinds of a priori knowledge, each with the field that identifies it."""
+"""The kinds of a priori knowledge, each with the field of a request that identifies it."""
 
 
 def faults_of(
@@ -42,7 +42,7 @@ def faults_of(
 
 
 def _meant(model: type[BaseModel] | None, fault: Any) -> str:
-    """The end of a message about an unknown field: the nearest known field, or all known ones."""
+    """The end of a message on an unknown field: the nearest known one, or all; else empty."""
     if model is None or fault["type"] != "extra_forbidden":
         return ""
     # In the model a field named like a Python keyword, such as from, ends with an underscore.
@@ -60,7 +60,7 @@ def _meant(model: type[BaseModel] | None, fault: Any) -> str:
 def checked_by(
     validate: Callable[[Any], Value], given: object, prefix: tuple[str, ...] = ()
 ) -> Value:
-    """The value returned by one of pydantic's validators for an input.
+    """The value that one of pydantic's validators returns for an input; raises `BadBatch`.
 
     Raises `BadBatch` with the faults, outside of the exception handler: pydantic's error holds the
     whole input, and as part of a reference cycle it would never be freed.

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 MOST_REMARKS = 40
 EARTH_RADIUS_KM = 6_350.0
-"""A radius in km a little below the Earth's polar radius."""
+"""A radius in km a little below Earth's polar radius, within which no spacecraft can be."""
 EARTH_GM_KM3_PER_S2 = 398_600.4418
 _VECTORS = ("velocity_km_per_s", "position_km")
 

@@ -32,9 +32,7 @@ class FrameRecord:
     preview: bytes
     preview_step: int
     remarks: Sequence[str] = ()
-    """Remarks on the fit of an uncalibrated camera, or the failure to find stars; on the chosen
-    image of a file, and on its orientation.
-    """
+    """Remarks on the fit of an uncalibrated camera, the chosen image, and its orientation."""
 
     def summary(self) -> dict[str, Any]:
         """The part of an answer that describes the frame, ready for JSON."""

@@ -21,7 +21,7 @@ from service.observations.decompress import Line, physical_lines
 from service.observations.gyro_rows import GYRO_ROWS, BlockRows
 
 NDJSON, CSV = "ndjson", "csv"
-"""Names of formats; NDJSON is the default for unknown suffixes."""
+"""Names of the two built-in telemetry formats; NDJSON is taken for unknown suffixes."""
 
 
 def _is_this(start: bytes) -> str | None:
@@ -30,7 +30,7 @@ def _is_this(start: bytes) -> str | None:
 
 @dataclass(frozen=True)
 class InputFormat:
-    """An input format of `acquire replay`.
+    """A format of input files that `acquire replay` reads.
 
     `given` is the command line argument for such a file. A telemetry format has `read`, which
     yields the batches and gyro blocks of a seekable stream as lines of JSON; other formats are read
@@ -159,7 +159,7 @@ CSV_COLUMNS: tuple[tuple[str, str, str], ...] = (
         "its covariance, by rows",
     ),
 )
-"""The CSV columns of batches: names of columns that belong together, unit, meaning."""
+"""The CSV columns of batches, in groups that belong together, with unit and meaning."""
 
 _CSV_NOTES = """\
 A header, then one star a row; the rows with the same spacecraft, run and batch form a batch, in

@@ -43,7 +43,7 @@ from service.times import parse_utc
 
 
 def is_time(text: str) -> str:
-    """A text checked to be a UTC time; raises `ValueError` otherwise, as pydantic expects."""
+    """The given text, checked to be a UTC time; raises `ValueError` otherwise, for pydantic."""
     try:
         parse_utc(text)
     except BadInput as error:
@@ -52,10 +52,10 @@ def is_time(text: str) -> str:
 
 
 Key = Annotated[str, Field(min_length=1, max_length=128, pattern=r"^[^\x00-\x1f\x7f]+$")]
-"""Looser pattern for looking up names: records of earlier versions hold some that are no `Name`."""
+"""Text that may name a record, checked loosely: earlier versions allowed more than `Name`."""
 Name = Annotated[str, Field(min_length=1, max_length=128, pattern=NAME_PATTERN)]
 LIVE = "live"
-"""Run of the batches that pipelines send."""
+"""Name of the run of the batches that operations send."""
 RunName = Annotated[
     str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.:-]*$")
 ]
@@ -366,14 +366,14 @@ def _require_ratio(variances: Sequence[float]) -> None:
 
 
 def none_beside_measurement(prior: Any, info: ValidationInfo) -> Any:
-    """The a priori knowledge of a batch, checked to be null beside a measured attitude."""
+    """The a priori knowledge of a batch; raises `ValueError` for any beside a measured attitude."""
     if prior is not None and info.data.get("measurement") is not None:
         raise ValueError("must be null: a measured attitude needs no a priori knowledge")
     return prior
 
 
 def no_options_beside_measurement(options: Any, info: ValidationInfo) -> Any:
-    """The options of a batch, checked to be absent beside a measured attitude."""
+    """The options of a batch, unchanged; raises `ValueError` if set beside a measured attitude."""
     if options.model_fields_set and info.data.get("measurement") is not None:
         raise ValueError("must be left out: a measured attitude is not searched for")
     return options
@@ -395,9 +395,9 @@ class MeasurementIn(BaseModel):
     sigma_arcsec: Annotated[tuple[Sigma, Sigma, Sigma], AfterValidator(_of_one_tracker)] | None = (
         None
     )
-    """One sigma of the rotation about each of those axes."""
+    """One sigma in arcsec of the rotation about each axis of the tracker, or of the body."""
     covariance_arcsec2: Annotated[PositiveDefinite, AfterValidator(_of_a_tracker)] | None = None
-    """Covariance of the small rotation about those axes, as an alternative to the sigmas."""
+    """Covariance in arcsec² of a small rotation about the axes of the tracker, or of the body."""
     frame: ReferenceFrame = "EME2000"
 
     @model_validator(mode="after")
@@ -432,7 +432,7 @@ class BatchIn(Wire):
 
 
 def prior_of(prior: APrioriIn) -> APriori:
-    """A priori knowledge without a batch, as the solver takes it; raises `BadBatch`."""
+    """A priori knowledge as the solver takes it, for no batch; raises `BadBatch` for the last."""
     known = prior_from_canonical(prior.model_dump_json(exclude_defaults=True))
     if known is None:
         raise BadBatch(Fault("a_priori.from", "is for batches alone", shown_value("last")))
@@ -440,7 +440,7 @@ def prior_of(prior: APrioriIn) -> APriori:
 
 
 class Checked(Struct, frozen=True):
-    """The canonical form of a batch that passed every check.
+    """A batch that passed every check, as canonical JSON with its fingerprint.
 
     `text` is its canonical JSON without defaults, which is recorded and can be run again.
     `fingerprint` is the digest of that text without additions of the service, so that white space
@@ -452,7 +452,7 @@ class Checked(Struct, frozen=True):
 
 
 class Submission(Struct, frozen=True, eq=False):
-    """A batch to be processed, with its canonical text and its fingerprint; see `Checked`.
+    """A batch to be processed, decoded, with its canonical JSON and its fingerprint.
 
     A batch made from a frame has the fingerprint of the frame and its metadata.
     """
@@ -464,7 +464,7 @@ class Submission(Struct, frozen=True, eq=False):
 
 
 def checked_from_json(body: bytes | str, run: str | None = None) -> Checked:
-    """The canonical form of one batch in JSON, after all checks; `run` overrides the batch's own.
+    """The canonical JSON of a batch after all checks; `run` overrides the batch's own.
 
     Raises `BadBatch` with every fault, each naming field and value.
     """
@@ -478,7 +478,7 @@ def checked_from_json(body: bytes | str, run: str | None = None) -> Checked:
 
 
 def checked_from_model(model: BatchIn) -> Checked:
-    """The canonical form of a validated model of a batch."""
+    """The canonical JSON and the fingerprint of a validated model of a batch."""
     model = without_fill_values(model)
     text, prior = model.model_dump_json(exclude_defaults=True), model.a_priori
     sent = text
@@ -502,7 +502,7 @@ _PREDICTED, _REMARKS = '"from":"last"', '"remarks":['
 
 
 def submission_from_json(body: bytes | str, run: str | None = None) -> Submission:
-    """One batch read from JSON, after all checks; see `checked_from_json`."""
+    """The submission of a batch in JSON, after all checks; see `checked_from_json`."""
     return submission_from_checked(checked_from_json(body, run))
 
 

@@ -74,7 +74,7 @@ def _not_telemetry(start: bytes, form: str) -> str | None:
 
 @contextmanager
 def _opened(source: Path | BinaryIO, form: str) -> Iterator[BinaryIO]:
-    """A file as UTF-8 with line feeds; other encodings are copied to a temporary file."""
+    """Context manager of a file as UTF-8 with line feeds; other encodings are converted first."""
     if not isinstance(source, Path):
         yield source
         return

@@ -19,7 +19,7 @@ BUILDS_AT_ONCE = 2
 
 
 class Sized(Protocol):
-    """The protocol of objects that know their size in bytes."""
+    """The protocol of cached objects, which know their size in bytes."""
 
     @property
     def nbytes(self) -> int:
@@ -81,7 +81,7 @@ class LruCache:
         find_builder: Callable[[], Executor | None] = lambda: None,
         wait: bool = True,
     ) -> tuple[T, bool]:
-        """The item under `key`, built by `build` if it is missing, and true if it was cached.
+        """The item under `key`, built by `build` if missing, and true unless this call built it.
 
         An error of `build` is raised for every waiting caller, and nothing is cached. If the item
         is missing and `find_builder` returns a builder, the caller neither builds nor waits: that

@@ -25,15 +25,15 @@ KM_PER_AU = erfa.DAU / 1000.0
 LIGHT_AU_PER_DAY = erfa.DAYSEC / erfa.AULT
 LIGHT_KM_PER_S = erfa.CMPS / 1000.0
 _ROUNDS_OF_ABERRATION = 3
-"""Iterations for removing aberration; each leaves 1e-4 of the previous error."""
+"""Number of iterations for removing aberration; each leaves 1e-4 of the error before."""
 _STEPS_PER_DAY = 32
-"""Interpolation nodes per day: cubic interpolation is within 0.03 m and 1e-8 m/s of epv00."""
+"""Nodes per day at which Earth's place is computed, for cubic interpolation between them."""
 
 
 EARTH_ORBIT_KM = 7_000.0
 """Largest distance from Earth's centre assumed for a spacecraft without a position, in km."""
 _ROUNDS_OF_LIGHT = 2
-"""Iterations of light time; two are correct within 1 us for Neptune."""
+"""Number of iterations of light time; two are correct within 1 us for Neptune."""
 
 
 # Plain numbers are faster: numpy's overhead is larger for six numbers.
@@ -56,7 +56,7 @@ def _earth(time: Utc) -> tuple[Triple, Triple, float]:
 
 @lru_cache(maxsize=256)
 def _about(number: int) -> list[list[float]]:
-    """Earth's six coordinates, each at four nodes from one before to two after a node number."""
+    """Earth's six coordinates at the four nodes about a time, from one before node `number`."""
     numbers: list[list[float]] = np.stack(
         [_at(number + step) for step in (-1, 0, 1, 2)], axis=1
     ).tolist()
@@ -65,7 +65,7 @@ def _about(number: int) -> list[list[float]]:
 
 @lru_cache(maxsize=1024)
 def _at(number: int) -> Vector:
-    """Earth at one node: heliocentric position in au and barycentric velocity in c, (6,)."""
+    """Earth at a node: heliocentric position in au and barycentric velocity in c, as (6,)."""
     # epv00 expects TDB, which differs from TT by under 2 ms. Its status only flags dates outside of
     # 1900 to 2100.
     heliocentric, barycentric, _ = ufunc.epv00(erfa.DJ00, number / _STEPS_PER_DAY)
@@ -73,7 +73,7 @@ def _at(number: int) -> Vector:
 
 
 def observer_velocity(time: Utc, velocity_km_per_s: npt.ArrayLike | None) -> Vector:
-    """The spacecraft's barycentric velocity (3,) in units of c.
+    """The barycentric velocity (3,) of a spacecraft, or of Earth, in units of c.
 
     It is Earth's velocity plus the spacecraft's geocentric one, if that is not None.
     """

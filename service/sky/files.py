@@ -33,24 +33,24 @@ log = logging.getLogger(__name__)
 
 
 class Content(NamedTuple):
-    """The content of a file: facts for JSON, and arrays by name."""
+    """The content of a sky file: JSON facts, and arrays by name."""
 
     facts: Mapping[str, Any]
     arrays: Mapping[str, npt.NDArray[Any]]
 
 
 def folder() -> Path:
-    """The folder for files made by the present state of the source code."""
+    """The folder for the sky files that the present state of the source code makes."""
     return Path(os.environ["NUMBA_CACHE_DIR"]) / f"sky-{source_digest()[:16]}"
 
 
 def is_kept(kind: str, key: Hashable) -> bool:
-    """True if the file of a kind and a key exists."""
+    """True if the sky file of some kind and key exists."""
     return _path(kind, key).exists()
 
 
 def kept(kind: str, key: Hashable, build: Callable[[], Content]) -> Content:
-    """The content of the file of a kind and a key, with mapped arrays; built if it does not exist.
+    """The content of the sky file of some kind and key, mapped; built if it does not exist.
 
     One of several processes builds the file, and the others wait. If no file can be written, each
     process uses its own content as built.
@@ -72,7 +72,7 @@ def _path(kind: str, key: Hashable) -> Path:
 
 
 def _opened(path: Path) -> Content | None:
-    """The content of a file; None if it is missing or damaged, and then removed."""
+    """The content of a sky file; None if it is missing or unreadable, or damaged and removed."""
     try:
         with path.open("rb") as file:
             np.lib.format.read_magic(file)
@@ -105,7 +105,7 @@ def _content(block: npt.NDArray[np.uint8]) -> Content:
 
 
 def _block(content: Content) -> npt.NDArray[np.uint8]:
-    """The bytes of a file: digest, length of the head, head, and the arrays one after another."""
+    """The bytes of a sky file: digest, length of the head, head, and the arrays one by one."""
     arrays = {name: np.ascontiguousarray(array) for name, array in content.arrays.items()}
     # The head's length depends on the offsets of the arrays that follow, so space is reserved.
     at = _aligned(_START + len(json.dumps(content.facts)) + 200 * (1 + len(arrays)))
@@ -151,7 +151,7 @@ def _write(path: Path, content: Content) -> bool:
 
 
 def _make_room(place: Path, nbytes: int) -> None:
-    """Remove the least recently opened files; processes that have mapped them keep the content."""
+    """Remove the least recently opened sky files until new bytes fit below the limit."""
     files = []
     for path in place.glob("*.npy"):
         with suppress(FileNotFoundError):  # removed by another process

@@ -45,19 +45,19 @@ class SkyModel:
     catalog: Catalog
     cache: LruCache
     require_whole_sky: Callable[[], None] = field(default=lambda: None, kw_only=True)
-    """Called before a search of the whole sky; raises `Busy` while its kernels are compiled."""
+    """Function called before a search of the whole sky; it raises `Busy` while kernels compile."""
     builder: Executor | None = field(default=None, kw_only=True)
-    """The executor that builds missing files, during which `BeingBuilt` is raised.
+    """The executor that builds missing sky files while `BeingBuilt` is raised, or None.
 
     None if the caller builds them.
     """
     opens_files: bool = field(default=True, kw_only=True)
-    """False if everything is built anew, for compiling the code that builds it."""
+    """False if content is built anew and not opened, so that the code that builds it compiles."""
     waits: bool = field(default=True, kw_only=True)
     """True if the model builds missing items; false if it raises `NotAtHand` instead."""
 
     def at_hand(self) -> "SkyModel":
-        """A view of the sky that never builds anything: it raises `NotAtHand` instead."""
+        """The same sky model, which raises `NotAtHand` instead of building anything."""
         return replace(self, waits=False, require_whole_sky=_not_at_hand)
 
     def run_catalog(self, mission: Mission, time: Utc) -> RunCatalog:
@@ -78,7 +78,7 @@ class SkyModel:
         build: Callable[[], Content],
         made_of: Callable[[Content], Kept],
     ) -> Kept:
-        """The object made by `made_of` from the content of a sky file, through the memory cache."""
+        """The object made from the content of a sky file, kept in the memory cache."""
 
         def find_builder() -> Executor | None:
             # Opening a file takes less time than waiting for another thread.

@@ -264,7 +264,7 @@ def _count_within(which, axes, leasts, mosts, direction, pair_rows, found):  # t
 
 @njit_no_refcount
 def _stars_inside(direction, axis, inner, outer, inside):  # type: ignore[no-untyped-def]
-    """Mark the stars (n, 3) with a cosine to the axis in bounds; true if one is near a bound.
+    """Mark the stars (n, 3) whose cosine to the axis is in bounds; true if one is near a bound.
 
     In that case the accurate angles decide. Written without branches, to be vectorised.
     """

@@ -132,7 +132,7 @@ def _is_same(match, other):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def _group(observed, stars, speed, pair_image, pair_star, seed, members):  # type: ignore[no-untyped-def]
-    """Collect proposals that agree with a seed and with each other, most likely first."""
+    """Collect a seed and the proposals that agree with it and each other; returns their number."""
     members[0] = seed
     size = 1
     for other in range(len(pair_image)):
@@ -175,7 +175,7 @@ def _agree(observed, stars, speed, i, j, a, b):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, error_model="numpy")
 def _grow(observed, stars, density, widest, match, rival, scratch):  # type: ignore[no-untyped-def]
-    """Fit an attitude, match all stars, fit again; the log of the chance expectation, or inf."""
+    """Fit an attitude, match all stars, fit again; log of the expected chance matches, or inf."""
     n = len(match)
     chance = math.inf
     for gate in (FIRST_GATE * GATE_SIGMAS, GATE_SIGMAS):
@@ -203,7 +203,7 @@ def _grow(observed, stars, density, widest, match, rival, scratch):  # type: ign
 
 @njit(nogil=True)
 def _widest(direction):  # type: ignore[no-untyped-def]
-    """Largest separation of stars in a field, at most a right angle, beyond which rings shrink."""
+    """Largest separation in radians of two stars in a field, at most a right angle."""
     widest = 0.0
     for i in range(len(direction)):
         for j in range(i):
@@ -213,7 +213,7 @@ def _widest(direction):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def _lay(observed, stars, t, gate, match, rival):  # type: ignore[no-untyped-def]
-    """Match each observed star to a catalog star at an attitude, and find a second match.
+    """Match each observed star to a catalog star at an attitude, and find a second match; else -1.
 
     A catalog star near two observed ones matches neither.
     """

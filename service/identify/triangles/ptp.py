@@ -95,7 +95,7 @@ def identify_triangles(
 
 @dataclass(frozen=True)
 class Proposals:
-    """Proposed identities from triangles: pairs of observed star and catalog row, most votes first.
+    """Proposed identities from triangle votes: (observed star, catalog row), most votes first.
 
     `held`: a sharing star validates a triangle with the identity. `searched` is the number of guide
     triangles compared; `bounded` is true if more matched than can be kept.
@@ -160,7 +160,7 @@ def explained(
 
 
 def observed_triangles(direction: Vector, triangles: TriangleIndex) -> tuple[Rows, Vector]:
-    """Triangles of observed stars, built like those of the guide: rows (t, 3), sides (t, 3)."""
+    """Triangles of observed stars, built like those of the guide: rows (t, 3) and sides (t, 3)."""
     near = np.empty((len(direction), triangles.slaves), np.int32)
     nearest_slaves(direction, *chords(triangles.reach_deg), near)
     most = len(direction) * len(pairs_of_slaves(triangles.slaves))

@@ -27,7 +27,7 @@ MAX_MATCHES = 20_000
 Rows = npt.NDArray[np.int32]
 Held = npt.NDArray[np.bool_]
 LEAST_TRIANGLES = 2
-"""Least number of triangles in which a sharing star must have the same identity."""
+"""Least number of matched triangles in which a sharing star must have the same identity."""
 
 
 @njit(nogil=True)
@@ -72,7 +72,7 @@ def projection_sigma(m, i, j, axis, sigma_m, sigma_i, sigma_j):  # type: ignore[
 
 
 class ImageTriangles(NamedTuple):
-    """The triangles (t) of n observed stars, in the form that kernels take.
+    """The triangles (t) of n observed stars, with the stars, in the form that kernels take.
 
     `direction` (n, 3) are unit vectors in any axes, `sigma_rad` (n,) their noise. `speed_c` is the
     observer's speed: the largest relative change of a side by aberration. `star` (t, 3) are rows of

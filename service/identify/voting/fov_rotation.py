@@ -53,7 +53,7 @@ def rotation_rad(
 
 @njit_no_refcount
 def _frame(first: Vector, second: Vector) -> Axes:
-    """A frame of two unit vectors: their middle, the direction between them, and the normal."""
+    """The three axes of a pair of unit vectors: their middle, their difference, and the normal."""
     middle = first[0] + second[0], first[1] + second[1], first[2] + second[2]
     along = second[0] - first[0], second[1] - first[1], second[2] - first[2]
     middle, along = _unit(middle), _unit(along)
@@ -62,7 +62,7 @@ def _frame(first: Vector, second: Vector) -> Axes:
 
 @njit_no_refcount
 def _carried(v: Triple, observed: Axes, candidate: Axes) -> Triple:
-    """A vector, rotated by the rotation from the observed to the candidate frame."""
+    """A vector after the rotation that turns the axes of the observed pair into the candidate's."""
     x, y, z = _dot(observed[0], v), _dot(observed[1], v), _dot(observed[2], v)
     one, two, three = candidate
     return (

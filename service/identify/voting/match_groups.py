@@ -26,7 +26,7 @@ MAX_HELD = 1 << 22
 def keep_largest_groups(
     votes: Integers, edges: Integers, max_work: int = MAX_WORK
 ) -> tuple[bool, int]:
-    """Remove from `votes` (n, m) all votes outside of the largest match groups.
+    """Remove votes outside of the largest match groups; returns if cut short, and the work.
 
     Returns true if the search was cut short, and the work in nodes visited. `edges` (E, 4):
     observed star, its zone row, the other observed star, its zone row. After a search cut short,

@@ -25,7 +25,7 @@ _SINGLE = 1e-6
 _ROUNDING = 1e-14
 
 REJECTED = 2
-"""The value returned instead of an order if a test rejects the candidate."""
+"""The value in place of a candidate pair's order if a test rejects the candidate."""
 
 
 class Rulebook(NamedTuple):
@@ -54,7 +54,7 @@ class Ballots(NamedTuple):
 
 
 class Tallies(NamedTuple):
-    """The results of the votes for each of n observed stars.
+    """The result of vote counting for each of n observed stars.
 
     The `outcome`, the winner's `star` (-1: none) and the `highest` and `second` tally, all (n,);
     `rivals` (n, R) the zone stars that tie for an ambiguous star's highest tally, brightest first,
@@ -274,7 +274,7 @@ def _order_by_rotation(sighted, bounds, tolerance, pair, star, a, b, order):  # 
 
 @njit_inlined
 def _vote(ballots, kept, i, a, j, b):  # type: ignore[no-untyped-def]
-    """Vote for observed star i being a and j being b; returns the number of edges kept."""
+    """Count a vote for star i being a, and one for j being b; returns the number of edges kept."""
     _count_up(ballots, i, a)
     _count_up(ballots, j, b)
     edges = ballots.edges
@@ -307,7 +307,7 @@ def tallies_of(found, first, last):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def tally(which, seen, zone, star_of, limits, switches, found):  # type: ignore[no-untyped-def]
-    """Cast and count the votes of the sightings that a zone serves.
+    """Cast and count the votes of all sightings that one zone serves.
 
     `which` are the sightings' rows in the columns `seen` and `found`.
     """
@@ -354,14 +354,14 @@ def polar_angles(zone_polar, stars, bounds, rules):  # type: ignore[no-untyped-d
 
 @njit_no_refcount
 def discard_votes(ballots):  # type: ignore[no-untyped-def]
-    """Discard all votes, since a winner of a partial count might not win the full one."""
+    """Discard all votes of a sighting, since an incomplete count may have the wrong winner."""
     ballots.votes[:] = 0
     ballots.counts[:] = 0
 
 
 @njit_no_refcount
 def count_votes(ballots, star_of, tallies):  # type: ignore[no-untyped-def]
-    """Fill the vote results except rivals; winners are recorded by their `star_of`.
+    """Fill in each star's winner and tallies from the votes; returns true if any is ambiguous.
 
     Returns true if any star is ambiguous.
     """
@@ -390,7 +390,7 @@ def count_votes(ballots, star_of, tallies):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def name_rivals(votes, star_of, tallies):  # type: ignore[no-untyped-def]
-    """Fill the rivals of ambiguous stars: the `star_of` of all with the highest tally."""
+    """Fill in the rivals of ambiguous stars: the catalog rows that tie for the highest tally."""
     rivals = tallies.rivals
     rivals[:] = -1
     for i in range(votes.shape[0]):

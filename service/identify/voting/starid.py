@@ -80,7 +80,7 @@ def ballots_for(n: int, stars: int, edges: int = 0) -> Ballots:
 def _tally_groups(
     s: int, seen: SightingColumns, zone: Zone, rules: Rules, found: IdentifiedColumns
 ) -> None:
-    """Count the votes of the largest match groups of one sighting; compare `tally`."""
+    """Count the votes of the largest match groups of one sighting, in place of `tally`."""
     first, last = seen.offsets[s : s + 2].tolist()
     n, stars, left = last - first, len(zone.star), int(seen.left[s])
     sighted, bounds = sighted_at(seen, s), bounds_at(seen, s)

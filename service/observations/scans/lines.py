@@ -20,7 +20,7 @@ BREAKDOWN_RATIO = 5.0
 
 @dataclass(frozen=True)
 class ProfileMoment:
-    """The first moment of a line of samples over their sum, in steps from the middle sample.
+    """The first moment of a line of samples over their sum, in steps from the middle one.
 
     `variance` is the full law sum (n - d)² sigma_n² / (sum)²; the report's 7.36 is the special case
     of white noise without displacement and photon noise.
@@ -33,12 +33,12 @@ class ProfileMoment:
 
     @property
     def signal_ratio(self) -> float:
-        """The ratio of the samples' sum to its own noise (7.30)."""
+        """The ratio of a line's sum of samples to its own noise (7.30)."""
         return self.total / math.sqrt(self.total_variance) if self.total_variance > 0 else math.inf
 
 
 def moment(samples: Vector, sample_variance: Vector, level_sigma: float = 0.0) -> ProfileMoment:
-    """The normalised first moment of samples n = -N ... N; `level_sigma` is a common error."""
+    """The normalised first moment of a line of samples; `level_sigma` is their common error."""
     steps = np.arange(len(samples), dtype=np.float64) - (len(samples) - 1) / 2.0
     total = float(samples.sum())
     displacement = float(steps @ samples) / total if total else math.nan
@@ -70,7 +70,7 @@ def cross_scan(
     background: float = 0.0,
     gain: float = math.inf,
 ) -> ScanResult:
-    """The displacement D = T sum n Phi_n / sum Phi_n of samples n = -N ... N, T apart (7.21, 7.22).
+    """The displacement of a star along a scan, from its samples and their spacing (7.21, 7.22).
 
     `background` is subtracted first; otherwise it would bias displacements towards zero. `gain` in
     photons per unit of Phi adds photon noise.

@@ -17,9 +17,9 @@ from service.vectors import Vector
 
 SAME_LIGHT_SIGMAS = 4.0
 SAME_LIGHT_SHARE = 0.02
-"""Tolerated difference of a star's light between columns and rows: each moment cuts off tails."""
+"""Largest difference of a star's light in columns and in rows, as a share of the light."""
 NOISE_SIGMAS = 2.0
-"""Difference of light, in sigmas, that noise alone often causes."""
+"""Difference of light in sigmas that noise alone often causes, and no hidden star."""
 
 
 class LinePlace(NamedTuple):
@@ -104,7 +104,7 @@ def _hidden_shift_lines(h: LinePlace, v: LinePlace, half_width_lines: int) -> fl
 
 
 def _pairs(along_h: list[LinePlace], along_v: list[LinePlace]) -> list[tuple[LinePlace, LinePlace]]:
-    """Pairs of column and row places with equal light, where each fits only the other."""
+    """Pairs of a column's and a row's place with equal light, where each fits only the other."""
     light, sigma = (
         [np.array([place[k] for place in along]) for along in (along_h, along_v)] for k in (2, 3)
     )

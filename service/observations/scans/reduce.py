@@ -1,5 +1,4 @@
-"""Conversion of scanning trackers' readings to measured angles, and a Sun tracker's counts to the
-Sun's direction.
+"""Conversion of trackers' readings: scans to measured angles, and Sun counts to a direction.
 
 The stored record keeps the readings as sent; angles and sigmas are computed with the mission's
 settings at every reading of the record.
@@ -193,7 +192,7 @@ class Crossing(NamedTuple):
 
 
 def crossing_of(times: Vector, scan: Sweep, field: str) -> Crossing:
-    """The mean crossing over all wires, at the mean of the crossing times.
+    """The mean of a star's crossings over all wires, at the mean of their times.
 
     `times` are in the mission's unit. Raises `BadBatch` naming `field` for a number of times other
     than that of the wires, for times that do not rise, and for times after the end of the sweep.

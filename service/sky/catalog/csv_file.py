@@ -23,7 +23,7 @@ FIRST_EPOCH, LAST_EPOCH = 1800.0, 2100.0
 
 @dataclass(frozen=True)
 class _NumberColumn:
-    """Allowed values of a numeric CSV column; `whole` numbers identify stars in other catalogs."""
+    """Numeric column of a CSV catalog: its name, allowed range, and value if the cell is empty."""
 
     column: str
     least: float
@@ -98,7 +98,7 @@ def read_csv_catalog(path: Path) -> dict[str, npt.NDArray[Any]]:
 
 
 def _require_degrees(values: Mapping[str, Sequence[float]]) -> None:
-    """Raise `BadFile` where the places of many stars are hours or radians by their ranges."""
+    """Raise `BadFile` if the places of many stars look like hours or radians by their ranges."""
     ra, dec = np.array(values["ra_deg"]), np.array(values["dec_deg"])
     if len(ra) < LEAST_JUDGED:
         return

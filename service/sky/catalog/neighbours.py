@@ -15,7 +15,7 @@ _BIN_MAG = 0.5
 def nearest_neighbours(
     direction: Vector, magnitude: Vector, others: Vector, others_magnitude: Vector
 ) -> dict[str, Vector]:
-    """The distance and magnitude difference of each star's nearest neighbour and nearest rival.
+    """Columns with the distance of each star's nearest neighbour and rival, and their magnitudes.
 
     Stars are unit vectors (N, 3) and magnitudes (N,); `others` (M, 3) are the possible neighbours,
     with the stars themselves as the first N rows. Returns four columns (N,) by their names in a
@@ -54,7 +54,7 @@ def _nearest(
     sought: np.typing.NDArray[np.intp],
     fainter_by: float = np.inf,
 ) -> tuple[Vector, Vector]:
-    """Distance in arcsec and magnitude difference of each star's nearest of the `sought` stars.
+    """Distance in arcsec and magnitude difference of each star's nearest sought star, or NaN.
 
     `own` is each star's row in `others`, which is not its own neighbour.
     """

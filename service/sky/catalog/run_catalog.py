@@ -54,7 +54,7 @@ class RunCatalog:
     epoch_year: float
     ra_deg: Vector
     dec_deg: Vector
-    """Right ascension and declination, ICRS at the epoch, exported; source of `direction`."""
+    """Right ascension and declination of the stars, ICRS at the epoch, as exported."""
     motion: Vector
     """Change of unit vectors per Julian year (N, 3), radians; flux-weighted for merged stars."""
     parallax_rad: Vector
@@ -79,7 +79,7 @@ class RunCatalog:
 
     @property
     def content(self) -> Content:
-        """The run catalog as the content of a file."""
+        """The run catalog as the content of a sky file."""
         facts = {
             "epoch_year": self.epoch_year,
             "digest": self.digest,
@@ -90,7 +90,7 @@ class RunCatalog:
 
     @classmethod
     def of_content(cls, content: Content) -> "RunCatalog":
-        """A run catalog from the content of a file."""
+        """A run catalog from the content of a sky file."""
         facts, arrays = content
         return cls(
             epoch_year=facts["epoch_year"],
@@ -115,7 +115,7 @@ class RunCatalog:
 
 @lru_cache(maxsize=32)
 def _on_day(run_catalog: RunCatalog, day: int) -> Vector:
-    """The directions of a run catalog's stars on a day, counted from Julian year 0."""
+    """The directions (N, 3) of a run catalog's stars on a day, counted from Julian year 0."""
     year = day / DAYS_PER_YEAR
     _, of_earth, _ = ufunc.epv00(J2000_JD, DAYS_PER_YEAR * (year - J2000_YEAR))
     seen = run_catalog.direction + (year - run_catalog.epoch_year) * run_catalog.motion
@@ -126,7 +126,7 @@ def _on_day(run_catalog: RunCatalog, day: int) -> Vector:
 def build_run_catalog(
     catalog: Catalog, settings: RunCatalogSettings, epoch_year: float
 ) -> RunCatalog:
-    """The run catalog for a mission's settings at an epoch in Julian years, e.g. 1996.0.
+    """The run catalog for a mission's settings at an epoch in Julian years, such as 1996.0.
 
     `rejected` lists, in catalog order, every star that is bright enough but has no entry: merged
     into a brighter one, or rejected.
@@ -219,7 +219,7 @@ def rejections(
     leads: npt.NDArray[np.bool_],
     judged: npt.NDArray[np.bool_],
 ) -> dict[int, str]:
-    """The catalog rows of the `judged` stars that are rejected, each with the reason.
+    """The reasons for rejecting stars, by the catalog rows of those `judged` that are rejected.
 
     A merged star is rejected with its leader. An unknown property rejects no star. Of several
     reasons the first is given.

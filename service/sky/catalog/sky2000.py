@@ -93,14 +93,14 @@ FIELDS: Mapping[str, RecordField] = {
     )
 }
 DECLINATION_SIGN, BLENDED_V = 130, 249
-"""Bytes of two flags: the sign of the declination, and `b` for blended light."""
+"""Positions in a SKY2000 record of two flags: the declination's sign, and `b` for blended light."""
 
 CatalogRecord = dict[str, float | None]
 
 
 @dataclass(frozen=True)
 class Read:
-    """The columns of a SKY2000 catalog, and the stars that have no visual magnitude."""
+    """The columns read from a SKY2000 catalog, and the stars without a visual magnitude."""
 
     columns: dict[str, npt.NDArray[Any]]
     without_magnitude: tuple[str, ...]
@@ -116,7 +116,7 @@ def is_sky2000(path: Path) -> bool:
 
 
 def read_sky2000(path: Path, step: Callable[[], object] = lambda: None) -> Read:
-    """The stars of a SKY2000 file, in its order; `step` is called after each record.
+    """The stars of a SKY2000 file as columns, in its order; `step` is called after each record.
 
     The magnitude is the observed V, or else the derived one; a star with neither is left out and
     listed. Components of a blended star with records of their own are marked as having their light
@@ -164,7 +164,7 @@ def _opened(path: Path) -> BufferedIOBase:
 
 
 def _records(path: Path, faults: list[Fault]) -> Iterator[tuple[int, str]]:
-    """Line numbers and texts of records of the right length; blank lines are skipped."""
+    """Line numbers and texts of a SKY2000 file's well-formed records; faults go to a list."""
     line = 0
     try:
         with _opened(path) as file:

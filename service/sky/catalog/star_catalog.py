@@ -58,7 +58,7 @@ class Catalog:
     neighbour_arcsec: Vector
     """Distance of the nearest neighbour of any known magnitude; NaN for none within a degree."""
     neighbour_fainter_by_mag: Vector
-    """The neighbour's V minus the star's: negative for a brighter neighbour."""
+    """V of the nearest neighbour minus the star's: negative for a brighter neighbour."""
     rival_arcsec: Vector
     """Distance of the nearest neighbour at most 2 mag fainter; NaN for none within a degree."""
     rival_fainter_by_mag: Vector
@@ -67,13 +67,13 @@ class Catalog:
     position_sigma_arcsec: Vector
     components: npt.NDArray[np.uint8]
     light_elsewhere: npt.NDArray[np.bool_]
-    """True if a neighbour's magnitude includes the star's light, which merging must not repeat."""
+    """True for stars whose light is in a neighbour's magnitude, so that merging must not add it."""
     hip: npt.NDArray[np.int32]
     tyc: npt.NDArray[np.uint16]
     hd: npt.NDArray[np.int32]
     sao: npt.NDArray[np.int32]
     label: npt.NDArray[np.str_] | None = None
-    """Identifiers of a site's own catalog, e.g. "SKYMAP 1234"; None with HIP or TYC numbers."""
+    """Identifiers of a site's own catalog, such as "SKYMAP 1234"; None with HIP or TYC numbers."""
 
     def __len__(self) -> int:
         return len(self.ra_deg)
@@ -137,7 +137,7 @@ def load_embedded() -> Catalog:
 
 
 def open_catalog(file: Path | None) -> Catalog:
-    """The site's catalog, or else the embedded one; raises `BadConfiguration` if it is damaged."""
+    """The site's catalog, or the embedded one without a file; raises `BadConfiguration` if bad."""
     if file is None:
         return load_embedded()
     try:

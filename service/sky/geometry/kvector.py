@@ -55,7 +55,7 @@ def build_kvector(value: Vector) -> KVector:
 
 @njit(nogil=True)
 def bracket(below, slope, intercept, low, high):  # type: ignore[no-untyped-def]
-    """The first row, and the one past the last, that a k-vector gives for a range of values.
+    """The first row, and the one past the last, between which a k-vector places a range of values.
 
     They include every value between `low` and `high`, except for rounding of the line, and on
     average one more row in total.

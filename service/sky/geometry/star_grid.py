@@ -13,7 +13,7 @@ from service.compiled.jit import njit
 from service.vectors import Vector, read_only
 
 CELL = 0.03
-"""Width of a grid cell, about 1.7 deg at the middle of a face: one star of a bright catalog each.
+"""Width of a grid cell in face coordinates: about one star of a bright catalog for each cell.
 
 Narrower cells hold fewer stars, but the look-up of a cell takes longer than its stars.
 """
@@ -23,7 +23,7 @@ EDGE = 0.03
 
 @dataclass(frozen=True)
 class StarGrid:
-    """Rows of zone stars, sorted by grid cell.
+    """Grid of zone stars: their rows sorted by cell, and the start of each cell.
 
     `box` (6, 4) holds each face's first cell along u and v and the number of cells along either;
     `offset` (6,) is the index of its cells in `start`, which has the index of each cell's first
@@ -77,7 +77,7 @@ def build_star_grid(direction: Vector) -> StarGrid:
 
 @njit(nogil=True)
 def cells_about(p, gate, box, out):  # type: ignore[no-untyped-def]
-    """The cube face of a direction, and the block of grid cells within `gate` radians.
+    """The cube face of a direction, and the block of grid cells that a gate in radians touches.
 
     Into `out`: face, first and last cell along u, first and last along v; in an empty block last is
     before first.

@@ -21,7 +21,7 @@ from service.compiled.jit import njit, njit_inlined, njit_no_refcount
 from service.vectors import Vector, locked, read_only
 
 CELL = 0.004
-"""Width of a bucket's cell, about 0.23 deg at the middle of a face."""
+"""Width of a hash cell in face coordinates, about 0.23 deg at the middle of a face."""
 _PER_CELL = 1.0 / CELL
 EDGE = 0.03
 """Distance in face coordinates beyond the edge of a face to which its stars extend."""
@@ -29,9 +29,9 @@ BUCKETS_PER_STAR = 4
 _FACE, _U, _V = 83492791, 73856093, 19349663
 """Odd multipliers that hash neighbouring cells to different buckets."""
 REACH_RAD = 4.5e-4 * 2.0 ** (0.5 * np.arange(7))
-"""Reach of the stars at each voxel level: 93 to 743 arcsec, as a chord in radians."""
+"""Distance from a star that its bits cover at each voxel level, as a chord in radians."""
 _SCALE = 0.5 / REACH_RAD
-"""Voxels per radian at each level: the ball about a star meets about six of them."""
+"""Voxels per unit of chord at each level, so that the ball about a star meets about six."""
 _BITS_PER_STAR = 128
 _X, _Y, _Z = 73856093, 19349663, 83492791
 """Odd multipliers that hash neighbouring voxels to different bits."""
@@ -40,7 +40,7 @@ Bits = npt.NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class StarBuckets:
-    """Rows of zone stars and their directions (k, 3), sorted by hash bucket.
+    """Hash of zone stars by cell: their rows and directions (k, 3), sorted by bucket.
 
     `start` has the first entry of each bucket and the end of the last; the number of buckets is a
     power of two.
@@ -86,7 +86,7 @@ def build_star_buckets(direction: Vector) -> StarBuckets:
 
 @njit_inlined
 def cells_about(x, y, z, gate):  # type: ignore[no-untyped-def]
-    """The cube face of a direction, and the block of cells within `gate` radians.
+    """The cube face of a direction, and the block of hash cells that a gate in radians touches.
 
     Returns the face, the first and last cell along u, and the first and last along v.
     """
@@ -148,7 +148,7 @@ def nearest(px, py, pz, gate, start, rows, direction, used, taken):  # type: ign
 
 
 def build_star_voxels(direction: Vector) -> Bits:
-    """The voxel bits (levels, bytes) of unit vectors (n, 3); a power of two per level."""
+    """Bits (levels, bytes) of the voxels near unit vectors (n, 3), a power of two at each level."""
     size = 1 << max(7, (len(direction) * _BITS_PER_STAR // 8 - 1).bit_length())
     bits = np.zeros((len(REACH_RAD), size), np.uint8)
     for level in range(len(REACH_RAD)):

@@ -108,12 +108,12 @@ def chords(reach_deg: float) -> tuple[float, float]:
 
 
 def pairs_of_slaves(slaves: int) -> list[tuple[int, int]]:
-    """The pairs of slaves, counted from the nearest, that make a triangle with their master."""
+    """Pairs of a master's slaves, numbered from the nearest, that make a triangle with it."""
     return [(i, j) for i in range(min(2, slaves)) for j in range(i + 1, slaves)]
 
 
 def principal_axis(side: Matrix) -> tuple[Vector, Vector, Vector]:
-    """The mean of triangle sides (N, 3), their principal axis, and the shares of variance.
+    """The mean of triangle sides (N, 3), their principal axis, and each axis' share of variance.
 
     The axis is a unit vector whose components have a positive sum.
     """
@@ -128,7 +128,7 @@ def principal_axis(side: Matrix) -> tuple[Vector, Vector, Vector]:
 
 
 def project(side: Matrix, axis: Vector, mean: Vector) -> Vector:
-    """Projections P = w . (x - mu) of triangle sides (N, 3) on the principal axis; equation 3."""
+    """Projections of triangle sides (N, 3), less their mean, on the principal axis (equation 3)."""
     return np.asarray((side - mean) @ axis)
 
 

@@ -15,14 +15,14 @@ from service.sky.geometry.directions import axes_across
 from service.vectors import Vector, locked
 
 CELLS = 1632
-"""Cells along an edge of the square to which the whole sky is unfolded, of 3.7 to 11 arcmin.
+"""Cells along an edge of the square on which the whole sky is unfolded, 3.7 to 11 arcmin wide.
 
 A bitmap takes 333 kB: several fit into a cache.
 """
 SAMPLE_RAD = 6e-4
 """Spacing of the points that fill a disc, less than the narrowest cell."""
 RIM_RAD, RIM_SAMPLE_RAD = 1.5e-4, 1e-4
-"""Distance of a rim outside of a disc, and the spacing of its points.
+"""Distance of a disc's rim beyond it, and the spacing of the rim's points, in radians.
 
 A cell whose corner barely reaches into the disc contains more of the rim than that, since no corner
 is sharper than 45 deg; the margin of 6 arcsec is for directions in single precision.
@@ -32,7 +32,7 @@ Bits = npt.NDArray[np.uint8]
 
 
 def build_sky_bitmap(direction: Vector, radius_rad: float) -> Bits:
-    """The bitmap of unit vectors (n, 3) with a radius, eight bits to a byte."""
+    """The bitmap of sky cells within a radius of unit vectors (n, 3), eight bits to a byte."""
     bits = np.zeros(CELLS * CELLS // 8, np.uint8)
     _fill(locked(direction), _disc(radius_rad), bits)
     return bits
@@ -40,7 +40,7 @@ def build_sky_bitmap(direction: Vector, radius_rad: float) -> Bits:
 
 @njit(nogil=True, inline="always")
 def cell_of(x, y, z):  # type: ignore[no-untyped-def]
-    """The bitmap cell of a direction of any length."""
+    """The number of the bitmap cell of a direction of any length."""
     scale = 1.0 / (abs(x) + abs(y) + abs(z))
     u, v = x * scale, y * scale
     # The lower half is folded outwards over the edges of the upper.
@@ -55,7 +55,7 @@ def cell_of(x, y, z):  # type: ignore[no-untyped-def]
 
 @njit(inline="always")
 def _single_cell(x, y, z):  # type: ignore[no-untyped-def]
-    """The bitmap cell of a direction, as `cell_of`, in single precision and vectorisable."""
+    """The number of the bitmap cell of a direction, in single precision and vectorisable."""
     one, half, last = np.float32(1.0), np.float32(0.5 * CELLS), np.int32(CELLS - 1)
     scale = one / (abs(x) + abs(y) + abs(z))
     u, v = x * scale, y * scale
@@ -71,7 +71,7 @@ def _single_cell(x, y, z):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, error_model="numpy", forceinline=True)
 def cells_of_pairs(count, alpha, beta, gamma, pair, cell):  # type: ignore[no-untyped-def]
-    """The cells (2, count) of one point's predicted places for many star pairs, in both orders.
+    """Write the cells (2, count) of one point's predicted places for star pairs in both orders.
 
     `pair` (6, m) holds the two directions of every pair, component by component; the coefficients
     belong to the two directions and their cross product. All are in single precision, which the
@@ -93,7 +93,7 @@ def cells_of_pairs(count, alpha, beta, gamma, pair, cell):  # type: ignore[no-un
 
 @njit(nogil=True, error_model="numpy", forceinline=True)
 def cells_of_points(count, coefficients, x, y, cell):  # type: ignore[no-untyped-def]
-    """Cells (count) of many points' predicted places, coefficients (3, count), for one pair."""
+    """Write the cells (count,) of many points' predicted places for one pair of stars."""
     x0, x1, x2, y0, y1, y2 = x[0], x[1], x[2], y[0], y[1], y[2]
     z0, z1, z2 = x1 * y2 - x2 * y1, x2 * y0 - x0 * y2, x0 * y1 - x1 * y0
     alpha, beta, gamma = coefficients[0], coefficients[1], coefficients[2]

@@ -12,7 +12,7 @@ from service.vectors import Vector, read_only
 
 FAINTEST_MAG = 9.0
 MERGED_ARCSEC = 40.0
-"""Distance in arcsec within which two stars are merged on most pictures, into the brighter one."""
+"""Distance in arcsec within which most pictures show two stars as one: the fainter is dropped."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +32,7 @@ class BrightStars:
 
     @cached_property
     def star_id(self) -> tuple[str, ...]:
-        """The identifiers of all bright stars."""
+        """The identifiers of all bright stars, brightest first."""
         return tuple(self.catalog.star_ids(self.row))
 
 

@@ -64,7 +64,7 @@ def densities(direction: Vector) -> Vector:
 
 @njit(nogil=True)
 def _count_near(direction, order, most, count):  # type: ignore[no-untyped-def]
-    """Add to `count` (n,) the number of others within a chord of each star; `order` sorts by z."""
+    """Add to `count` (n,) the number of other stars within a chord of each star."""
     for at in range(len(order)):
         one = order[at]
         for other_at in range(at + 1, len(order)):

@@ -32,11 +32,11 @@ FIRST, LAST, ROWS = 0, 1, 2
 
 StoreBytes = npt.NDArray[np.uint8]
 Form = tuple[str, Sequence[int]]
-"""The data type and shape of an array."""
+"""The data type and shape of an array, from which its view is made."""
 
 
 def stored(arrays: Sequence[npt.NDArray[Any]]) -> tuple[StoreBytes, list[npt.NDArray[Any]]]:
-    """Arrays copied into one read-only block, and views of the copies."""
+    """A read-only block with copies of arrays, and views of the copies."""
     head = np.zeros(HEAD_WORDS, np.int64)
     at = head.nbytes
     for k, array in enumerate(arrays):
@@ -52,7 +52,7 @@ def stored(arrays: Sequence[npt.NDArray[Any]]) -> tuple[StoreBytes, list[npt.NDA
 
 
 def views_of(store: StoreBytes, forms: Sequence[Form]) -> list[npt.NDArray[Any]]:
-    """Read-only views of the arrays in a block, with given types and shapes."""
+    """Read-only views of the arrays in a block, by their types and shapes."""
     head = store[: 8 * HEAD_WORDS].view(np.int64)
     return [
         read_only(store[head[3 * k + FIRST] : head[3 * k + LAST]].view(dtype).reshape(shape))
@@ -71,15 +71,15 @@ BITMAP_RADII_RAD = tuple(
     for arcsec in (60.0, 140.0, 190.0, 240.0, 310.0, 400.0, 530.0, 700.0, 1500.0)
 )
 PATCHES = 24
-"""Number of patches along an edge of a face of the cube."""
+"""Number of sky patches along an edge of each face of the cube."""
 PATCH_RADIUS_RAD = math.sqrt(2.0) / PATCHES
 """Largest distance from the middle of a patch to its corners, at a face's middle, in radians."""
 BRIGHTEST_MAG, STEP_MAG = -2.0, 0.05
-"""First magnitude, and step, of the table of rows by magnitude."""
+"""First magnitude and step of the table that counts brighter stars by magnitude."""
 MAX_STARS = 60_000
-"""Largest number of stars, since rows are stored in 16 bits."""
+"""Largest number of stars in a whole-sky index, since rows are stored in 16 bits."""
 MAX_PAIRS = 1_500_000
-"""Largest number of pairs (6 MB); of a deeper catalog only the brightest stars are used."""
+"""Largest number of pairs in a whole-sky index (6 MB), which limits the stars of deep catalogs."""
 
 
 class Index(NamedTuple):
@@ -111,7 +111,7 @@ class Index(NamedTuple):
 
 ARRAYS = len(Index._fields)
 AT = Index(*range(ARRAYS))
-"""The index of each array in the head of the store."""
+"""The position of each array in the head of an index's block of memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +138,7 @@ class SkyIndex:
 
     @property
     def content(self) -> Content:
-        """The whole-sky index as the content of a file."""
+        """The whole-sky index as the content of a sky file."""
         facts = {
             "run_catalog": self.run_catalog,
             "limit_mag": self.limit_mag,
@@ -149,7 +149,7 @@ class SkyIndex:
 
     @classmethod
     def of_content(cls, content: Content) -> "SkyIndex":
-        """A whole-sky index from the content of a file."""
+        """A whole-sky index from the content of a sky file."""
         facts, store = dict(content.facts), content.arrays["store"]
         arrays = Index(*views_of(store, facts.pop("forms")))
         return cls(**facts, store=store, arrays=arrays)
@@ -166,7 +166,7 @@ class SkyIndex:
 
 
 def build_sky_index(run_catalog: RunCatalog, limit_mag: float, radius_deg: float) -> SkyIndex:
-    """Index stars to a limit, for fields of view whose farthest corner is at `radius_deg`.
+    """The whole-sky index of stars to a limit, for fields of view with corners at `radius_deg`.
 
     Fainter stars of the run catalog are used for matching only. If there are too many stars, the
     faintest are left out.
@@ -232,7 +232,7 @@ def _brighter(magnitude: Vector) -> npt.NDArray[np.int32]:
 
 @njit(nogil=True)
 def index_in(store):  # type: ignore[no-untyped-def]
-    """The whole-sky index in a store; the caller keeps the store alive."""
+    """Views of the whole-sky index in a block of memory, which the caller keeps alive."""
     head = view_into(store, 0, (ARRAYS, 3), np.int64)
     classes, levels = head[AT.offset, ROWS], head[AT.bits, ROWS]
     buckets = (head[AT.offset, LAST] - head[AT.offset, FIRST]) // 4 // classes
@@ -267,7 +267,7 @@ def _column(store, head, at, dtype):  # type: ignore[no-untyped-def]
 def _patches(
     direction: Vector, radius_deg: float
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.uint16]]:
-    """For each patch of the sky: the stars of any field of view with its boresight in the patch."""
+    """Start and rows, by sky patch, of the stars in any field of view aimed at that patch."""
     least = math.cos(min(math.radians(radius_deg) + PATCH_RADIUS_RAD, math.pi))
     middle = (np.arange(PATCHES) + 0.5) * 2.0 / PATCHES - 1.0
     start, rows = [0], []
