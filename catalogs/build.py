@@ -26,7 +26,7 @@ _VARIABLES = "usr/share/stellarium/stars/default/gcvs_hip_part.dat"
 
 @dataclass(frozen=True)
 class BuildReport:
-    """What a build made."""
+    """Report of a build of the embedded catalog."""
 
     output: Path
     digest: str
@@ -81,7 +81,7 @@ def _hd_numbers(names: dict[str, dict[str, Any]]) -> Iterator[tuple[int, float]]
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """The command; 0 when the file is written, 2 when a package is missing or wrong."""
+    """Build the embedded catalog; returns 0, or 2 for a missing or wrong package."""
     parser = argparse.ArgumentParser(
         prog="python -m catalogs.build",
         description=__doc__,

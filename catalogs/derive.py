@@ -18,11 +18,11 @@ NEIGHBOUR_LIMIT_MAG = 11.0
 HIPPARCOS_EPOCH, EPOCH = 1991.25, 2000.0
 
 SAME_STAR_ARCSEC = 10.0
-"""Hipparcos gives one entry, with the light of all, to components closer than this."""
+"""Separation (arcsec) below which Hipparcos gives components one entry, with all their light."""
 CONFIRMED_MAG = 0.5
-"""Hipparcos' V of a star without a solution stands if Tycho-2 agrees within this."""
+"""Largest difference from Tycho-2 with which Hipparcos' V of a star without a solution stands."""
 DISAGREES_ARCSEC = 0.5
-"""More than the rounding of bigsky can part two places of one star."""
+"""Distance (arcsec) between two places of one star that bigsky's rounding does not explain."""
 
 # Standard deviations of a position per axis, in arcsec, by where it is from.
 SOLVED_ARCSEC = 0.01  # Hipparcos: about 1 mas at 1991.25 and 1 mas/year to 2000
@@ -84,7 +84,7 @@ def bigsky(table: Mapping[str, npt.NDArray[Any]]) -> Rows:
 
 
 def compare(hip: Rows, tycho: Rows) -> int:
-    """Completes Hipparcos rows from bigsky; gives how many positions the two disagree about.
+    """Complete Hipparcos rows from bigsky; returns on how many positions to V 9.0 they disagree.
 
     A row gets its Tycho identifier and the count of its components there; of
     several the brightest, then the first, names the star.  Where a single
@@ -112,7 +112,7 @@ def compare(hip: Rows, tycho: Rows) -> int:
 
 @dataclass(frozen=True)
 class Filling:
-    """What became of the Hipparcos stars to V 9.0 that have no position of their own."""
+    """Counts of what became of the Hipparcos stars to V 9.0 that have no position of their own."""
 
     confirmed: int
     corrected: int
@@ -122,7 +122,7 @@ class Filling:
 
 
 def fill(hip: Rows, tycho: Rows, coarse: Mapping[int, tuple[float, float]]) -> Filling:
-    """Fills in place the Hipparcos rows that have no position; gives what became of them.
+    """Fill in place the Hipparcos rows that have no position; returns counts of what came of it.
 
     `coarse` holds their positions at 1991.25, good to some arcseconds.  The
     Tycho-2 stars without a Hipparcos number that are nearest to such a

@@ -223,7 +223,7 @@ OF_ALIASES = [each for alias in vars(base).values() for each in metadata_of(alia
 
 
 def description(hint: Any) -> str | None:
-    """Description of a field in its annotation, without those of common types such as times."""
+    """Description in a field's annotation, without those of common types; None without any."""
     found = [
         each.description
         for each in metadata_of(hint)

@@ -75,7 +75,7 @@ class _Method:
         update_wrapper(cast(Any, self), describe)
 
     def function_of(self, owner: type["Caller"]) -> Callable[..., Any]:
-        """Function that replaces this description in a class of clients."""
+        """Function that replaces the described method in a class of clients."""
         # The two kinds of methods override this.
         raise NotImplementedError
 

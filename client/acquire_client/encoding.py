@@ -40,7 +40,7 @@ def checked_address(url: str) -> httpx.URL:
 
 
 def bearer_of(token: str | None) -> dict[str, str]:
-    """Header with a token; raises `InvalidArgument`, without naming the token, for an invalid one.
+    """Header with a token, none without one; raises `InvalidArgument`, which hides the token.
 
     A token that was read from a file may end in a newline.
     """

@@ -187,7 +187,7 @@ def problem_of(response: httpx.Response) -> Problem:
 
 
 def retry_after_s(response: httpx.Response) -> float | None:
-    """Seconds to wait that an answer asks for (`Retry-After`, RFC 9110), directly or as a date.
+    """Seconds to wait by `Retry-After` (RFC 9110), as a number or a date; None without one.
 
     The date is compared with the service's own clock where the answer has its `Date`.
     """

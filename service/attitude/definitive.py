@@ -64,7 +64,7 @@ class TimedColumns:
         return len(self.tai_ns)
 
     def taken(self, places: Any) -> Self:
-        """The rows of the columns at given indices."""
+        """The same columns with the rows at given indices only."""
         return type(self)(**{each.name: getattr(self, each.name)[places] for each in fields(self)})
 
     @classmethod

@@ -80,7 +80,7 @@ def predict_at_rate(known: Known, tai_ns: int, rate: Rate, walk_rad_s1_5: float)
 def predict_by_gyro(
     known: Known, tai_ns: int, model: GyroModel, samples: GyroSamples, walk_rad_s1_5: float
 ) -> Known | None:
-    """The attitude predicted to a later time by gyro samples; None if they do not reach that time.
+    """The attitude predicted to a later time by gyro samples; None if they leave a gap.
 
     The last sample may be one step old. The bias is assumed zero, with the model's sigma.
     """
@@ -140,7 +140,7 @@ def _compose(after: Vector, before: Vector) -> Vector:
 
 
 def _product(quaternions: Vector) -> Vector:
-    """Quaternion (4,) of A(last) ... A(first), multiplied in pairs, since a loop would be slow."""
+    """Quaternion (4,) of the product of all rotations, the last one leftmost, taken in pairs."""
     while len(quaternions) > 1:
         odd = quaternions[-1:] if len(quaternions) % 2 else quaternions[:0]
         even = len(quaternions) - len(odd)

@@ -34,11 +34,11 @@ class NoAttitude(StrEnum):
     FEWER_THAN_TWO_UNIQUE_STARS = "fewer_than_two_unique_stars"
     DEGENERATE_GEOMETRY = "degenerate_geometry"
     FEWER_THAN_THREE_STARS = "fewer_than_three_stars"
-    """Without a prior, two stars are ambiguous."""
+    """Reason for no attitude: without a prior, two stars are ambiguous."""
     NO_MATCH = "no_match"
-    """No attitude in the whole sky explains three of the stars."""
+    """Reason for no attitude: none in the whole sky explains three of the stars."""
     DOUBTFUL_MATCH = "doubtful_match"
-    """An attitude explains some stars, but so may chance or another attitude."""
+    """Reason for no attitude: one explains some stars, but so may chance or another."""
 
 
 @dataclass(frozen=True)

@@ -248,7 +248,7 @@ class _BitcodeLibrary(JITCodeLibrary):
         self._finalized = True
 
     def get_pointer_to_function(self, name: str) -> int:
-        """Zero, since there is no machine code."""
+        """Zero in place of an address, since bitcode is no machine code."""
         return 0
 
 

@@ -98,7 +98,7 @@ class SampleTaken(Conflict):
 
 
 def first_shared_ns(times_ns: Nanoseconds, others_ns: Nanoseconds) -> int | None:
-    """The first of the times that also occurs in another block, or None; both sorted."""
+    """The first of the times that also occurs in another block; None if none does; both sorted."""
     place = np.searchsorted(others_ns, times_ns)
     after = others_ns[np.minimum(place, others_ns.size - 1)]
     before = others_ns[np.maximum(place - 1, 0)]
@@ -204,7 +204,7 @@ def block_from_line(line: bytes | str, run: str | None = None) -> GyroBlock:
 
 
 class _Named(msgspec.Struct):
-    """The JSON field that distinguishes a gyro block from a batch."""
+    """JSON with the one field that distinguishes a gyro block from a batch."""
 
     rates_rad_per_s: msgspec.Raw | msgspec.UnsetType = msgspec.UNSET
 
@@ -256,7 +256,7 @@ def block_from_model(model: GyroBlockIn, spacecraft: str, run: str | None = None
 
 
 def _once(times_s: Vector, rates: Vector) -> tuple[Vector, Vector]:
-    """The samples without exact repetitions of the previous one, in time and rates."""
+    """Times and rates without exact repetitions of the sample before, if they are as many."""
     if times_s.size != len(rates):
         return times_s, rates
     again = (np.diff(times_s) == 0.0) & (np.diff(rates, axis=0) == 0.0).all(axis=1)

@@ -131,7 +131,7 @@ def turns_beside_bias(
 def gyro_samples(
     settings: GyroSettings, tai_ns: Times, rates_rad_s: Vector
 ) -> tuple[GyroModel, GyroSamples]:
-    """Error model and the samples of an interval: mean rates since the previous sample, body axes.
+    """Error model of a gyro, and its samples in an interval as mean rates about the body axes.
 
     `tai_ns` (n,) are sorted, and `rates_rad_s` (n, 3) are as recorded, about the gyro's axes.
     """

@@ -45,7 +45,7 @@ MOST_STARS = 250
 _ROUNDS = 50
 _NEAR_ENOUGH = 1e-12
 UNKNOWN_FIELD_DEG = 40.0
-"""Field of view in degrees assumed if a file states neither that nor a focal length."""
+"""Field of view in degrees assumed for a camera whose mission file states no scale."""
 UNKNOWN_LIMIT_MAG = 7.0
 ROOM = 1.3
 """Factor by which a roughly stated field of view may be too small."""
@@ -319,7 +319,7 @@ def with_camera_defaults(table: dict[str, Any]) -> dict[str, Any]:
 def camera_defaults(
     camera: dict[str, Any], field_of_view_deg: Sequence[float] | None = None
 ) -> dict[str, Any]:
-    """A camera's table completed with default values.
+    """A mission file's camera table completed with default values.
 
     A missing focal length is computed from `field_of_view_deg` and the width. Raises `KeyError`,
     `TypeError` or `ValueError` for a size or scale that is missing or wrong.
@@ -358,7 +358,7 @@ def _half_px(camera: Mapping[str, Any], axis: tuple[str, str]) -> float:
 
 
 def _focal_px(camera: dict[str, Any]) -> tuple[float, str | None]:
-    """The focal length in pixels, and the key it was computed from."""
+    """The focal length of a camera in pixels, and the key of the file that gives it, or None."""
     if "focal_length_px" in camera:
         return float(camera["focal_length_px"]), "focal_length_px"
     if "focal_length_mm" in camera or "pixel_um" in camera:
@@ -372,7 +372,7 @@ def _focal_px(camera: dict[str, Any]) -> tuple[float, str | None]:
 
 
 def _limit_mag(field_deg2: float) -> float:
-    """The magnitude down to which a field of view holds the wanted number of stars on average."""
+    """The magnitude down to which a field of view holds `WANTED_STARS` stars on average."""
     wanted = math.log(WANTED_STARS * 41253.0 / field_deg2)
     magnitudes, counts = zip(*STARS_TO_MAG, strict=True)
     return round(float(np.interp(wanted, np.log(counts), magnitudes)), 1)

@@ -135,9 +135,7 @@ def _example(location: Location) -> Any:
 
 
 def causes(faults: Sequence[PydanticFault]) -> list[PydanticFault]:
-    """The validation errors that are not consequences of others, first unknown keys, then wrong
-    values, then missing keys.
-    """
+    """Validation errors that follow from no others: unknown keys, wrong values, missing keys."""
     joined = [*map(_of_kind, _of_lists(faults))]
     # A client may send any number of unknown keys: the time must be linear in it.
     wholes: set[Location] = set()
@@ -162,7 +160,7 @@ def causes(faults: Sequence[PydanticFault]) -> list[PydanticFault]:
 def of_the_form_given(
     faults: Sequence[PydanticFault], key_of: Callable[[PydanticFault], str]
 ) -> list[PydanticFault]:
-    """The errors without those for alternative types of a value that the file does not use.
+    """Validation errors without those for types of a value that the file does not use.
 
     For a value of several types, pydantic reports one error for each.
     """
@@ -178,7 +176,7 @@ def of_the_form_given(
 
 
 def nearest(name: Any, known: Sequence[Any]) -> str | None:
-    """The known name with the most similar spelling, or None."""
+    """The known name most similar in spelling; None if none is, or if the name is too long."""
     if len(str(name)) > LONGEST_NAME:
         return None
     names = [*map(str, known)]
@@ -191,7 +189,7 @@ def nearest(name: Any, known: Sequence[Any]) -> str | None:
 
 
 def _of_kind(fault: PydanticFault) -> PydanticFault:
-    """An error, moved to the key that names the kind where a table is of an unknown kind."""
+    """A validation error, moved to the key of a table's kind if that is wrong or missing."""
     key = str(fault.get("ctx", {}).get("discriminator", "")).strip("'")
     if fault["type"] not in ("union_tag_invalid", "union_tag_not_found") or not key.isidentifier():
         return fault
@@ -207,7 +205,7 @@ _RANK = {"extra_forbidden": 0, "missing": 2}
 
 
 def _of_lists(faults: Sequence[PydanticFault]) -> Iterator[PydanticFault]:
-    """The errors, with one for a whole list instead of one for every missing entry."""
+    """The validation errors, with one for a whole list instead of one for each missing entry."""
     lacking: dict[Location, int] = {}
     for fault in faults:
         location = fault["loc"]
@@ -315,7 +313,7 @@ def _steps(model: type[BaseModel], location: Sequence[str | int]) -> Iterator[st
 
 
 def _after(models: Models, part: str | int) -> tuple[bool, Models]:
-    """True if one part of an error's location is a key or index; and the tables at that part."""
+    """True if a part of an error's location is a key or index, and the models at that part."""
     fields = [each.model_fields[part] for each in models if part in each.model_fields]
     if fields:
         return True, [found for field in fields for found in _models_in(field.annotation)]

@@ -171,7 +171,7 @@ def rules_of(tolerances: Tolerances, tests: Tests) -> Rules:
 
 
 TESTS_OF_ROLL = ("cross_product", "fov_rotation")
-"""The tests that need the presumed roll, which an a priori boresight does not give."""
+"""Names of the tests that need the presumed roll, which an a priori boresight does not give."""
 
 
 class RunCatalogSettings(Strict):
@@ -404,7 +404,7 @@ class Mission(Strict):
 
     @cached_property
     def axis_body(self) -> Vector:
-        """The zone's body axis as a unit vector."""
+        """The body axis (3,) about which the mission's zone lies, as a unit vector."""
         return read_only(unit(self.zone.axis_body))
 
     def tracker(self, name: str, field: str) -> Tracker:
@@ -484,7 +484,7 @@ def load_missions(*places: Path | None, shipped: bool = True) -> dict[str, Missi
 
 
 def mission_files(*places: Path | None, shipped: bool = True) -> dict[str, tuple[Mission, Path]]:
-    """The missions of `load_missions` by name, each with the path of its file."""
+    """The missions that `load_missions` gives, by name, each with the path of its file."""
     found: dict[str, tuple[Mission, Path]] = {}
     if shipped:
         found |= {

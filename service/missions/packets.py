@@ -42,7 +42,7 @@ Upper = (
 """The upper triangle of a symmetric matrix by rows, as parameters: 11, 12, 13, 22, 23, 33."""
 ValidLabels = Annotated[tuple[str, ...], Field(min_length=1, max_length=100)] | None
 _no_labels: Any = Field(default=None, exclude_if=lambda labels: labels is None)
-"""A default for labels that keeps them out of the mission's digest if missing."""
+"""Field without labels by default, which are then no part of the mission's digest."""
 SigmaArcsec = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
@@ -69,9 +69,9 @@ class CdsTime(Strict):
     day: ParameterName
     millisecond: ParameterName
     microsecond: ParameterName | None = None
-    """The parameter with the microseconds of the millisecond."""
+    """The parameter with the microseconds within the millisecond, if there is one."""
     epoch: date = date(1958, 1, 1)
-    """The date of day number 0."""
+    """The date of day number 0 in a CCSDS day segmented time."""
 
 
 class CucTime(Strict):
@@ -83,7 +83,7 @@ class CucTime(Strict):
     fine_bits: int = Field(default=16, ge=1, le=64)
     """Number of bits of the fine time, which counts in units of 2^-fine_bits s."""
     epoch: datetime = datetime(1958, 1, 1)
-    """The epoch of the seconds, on the clock of `scale`."""
+    """The epoch from which the seconds count, on the clock of `scale`."""
     scale: Literal["tai", "gps", "utc"] = "tai"
     """Clock of the seconds; `tai` and `gps` count leap seconds, `utc` omits them as POSIX does."""
 
@@ -170,16 +170,16 @@ class PacketMeasurement(Strict):
     """The tracker whose axes the attitude describes; None for the body's axes."""
     scalar: Literal["last", "first"] = "last"
     direction: Literal["inertial_to_body", "body_to_inertial"] = "inertial_to_body"
-    """Sense of the quaternion; with `tracker`, read tracker axes for body axes."""
+    """Direction of the quaternion's rotation; with `tracker`, its axes stand for the body's."""
     frame: Literal["EME2000", "ICRF", "GCRF"] = "EME2000"
     sigma: Triple | None = None
     """Parameters of one sigma of the rotation about each of the attitude's axes."""
     covariance: Upper | None = None
-    """Parameters of the covariance of that rotation, as an alternative to the sigmas."""
+    """Parameters of the covariance about the attitude's axes, in place of the sigmas."""
     angle_unit: Literal["deg", "arcmin", "arcsec", "rad"] = "arcsec"
     """Unit of `sigma`; the unit of `covariance` is its square."""
     sigma_arcsec: tuple[SigmaArcsec, SigmaArcsec, SigmaArcsec] | None = None
-    """Constant sigmas in arcsec, as an alternative to parameters."""
+    """Constant sigmas of the measured attitude in arcsec, in place of parameters."""
     valid: ParameterName | None = None
     """The parameter that is nonzero if the packet holds an attitude."""
     valid_labels: ValidLabels = _no_labels
@@ -229,7 +229,7 @@ class PacketGyroBlocks(Strict):
     """Number of gyro samples in one packet, numbered from `first_sample`."""
     first_sample: int = Field(default=1, ge=0, le=1000)
     values: tuple[SlotNames, SlotNames, SlotNames]
-    """For each axis, the parameters of the samples: arrays, patterns or lists."""
+    """Parameters of the gyro samples about each axis: arrays, patterns or lists."""
     kind: Literal["rate", "angle"] = "rate"
     """Meaning of gyro values: with `angle` an accumulating counter, whose change gives the rate."""
     scale_rad: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -239,13 +239,13 @@ class PacketGyroBlocks(Strict):
     max_gap_s: float = Field(default=10.0, gt=0, le=3600)
     """Largest interval in seconds between accumulated angles that give a rate."""
     time: PacketTime | None = None
-    """The time of the first sample; by default the time of the packet."""
+    """The time of the first gyro sample in a packet; by default the time of the packet."""
     step_s: float | None = Field(default=None, gt=0, le=3600)
-    """Interval in seconds between the samples of a packet."""
+    """Interval in seconds between the gyro samples of a packet."""
     time_offset_s: SlotNames | None = None
-    """Alternative to `step`: the offset of each sample from the time, in seconds."""
+    """Offset in seconds of each gyro sample from the time, in place of a constant step."""
     count: ParameterName | None = None
-    """The parameter with the number of samples, counted from the first, in the packet."""
+    """The parameter with the number of gyro samples in the packet, counted from the first."""
     block_s: float = Field(default=600.0, ge=1, le=86400)
     """Length of gyro blocks in seconds of TAI, at fixed boundaries, so that the same samples give
     the same blocks from any file.

@@ -125,7 +125,7 @@ class Raster(_Detector):
         return self
 
     def middle(self, axis: Literal["h", "v"]) -> float:
-        """The position of the boresight in lines from the first one."""
+        """Position of the boresight along an axis of the raster, in lines from the first one."""
         return ((self.columns if axis == "h" else self.rows) - 1) / 2.0
 
 

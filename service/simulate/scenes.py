@@ -125,7 +125,7 @@ class SceneSky:
 
     @classmethod
     def to_magnitude(cls, limit_mag: float, catalog: Catalog | None = None) -> "SceneSky":
-        """Stars down to a magnitude limit; a brighter limit gives the same rows, only fewer."""
+        """Sky of the stars down to a magnitude limit; a brighter limit gives fewer of its rows."""
         settings = RunCatalogSettings(
             magnitude_limit_mag=limit_mag, merge_within_arcsec=MERGE_WITHIN_ARCSEC
         )
@@ -133,7 +133,7 @@ class SceneSky:
 
     @classmethod
     def for_conditions(cls, conditions: Conditions) -> "SceneSky":
-        """Stars down to the faintest magnitude that noise can bring within the limit."""
+        """Sky of the stars down to the faintest that noise can bring within the limit."""
         return cls.to_magnitude(
             conditions.limit_mag + FAINTEST_SIGMA * conditions.magnitude_sigma_mag
         )

@@ -68,12 +68,12 @@ class Score:
 
     @property
     def seen_sigma_arcsec(self) -> float:
-        """Actual error about the worst axis of each attitude, one sigma, in arcsec."""
+        """Robust sigma in arcsec of the attitudes' actual errors about their worst axes."""
         return _median(self.worst_axis_arcsec) / GAUSSIAN_MEDIAN
 
     @property
     def predicted_sigma_arcsec(self) -> float:
-        """Error about the worst axis of each attitude as predicted by covariances, in arcsec."""
+        """Median in arcsec of the errors that covariances predict about the worst axes."""
         return _median(self.predicted_arcsec)
 
     @property
@@ -96,7 +96,7 @@ class Score:
 def score(
     results: Iterable[Mapping[str, Any]], truths: Iterable[Mapping[str, Any]]
 ) -> dict[str, Score]:
-    """Score results against truths in the same order; one score per kind of interval.
+    """Scores of results against truths in the same order, by kind of simulated error.
 
     A refused batch is counted as such and has no stars.
     """
@@ -111,7 +111,7 @@ def score(
 
 
 def together(scores: Iterable[Score]) -> Score:
-    """Sum of several scores."""
+    """The score of all batches behind several scores together."""
     whole = Score()
     for each in scores:
         whole.batches += each.batches

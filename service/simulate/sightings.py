@@ -47,7 +47,7 @@ class Seen:
     offset_s: Vector
     magnitude: Vector
     star: npt.NDArray[np.intp]
-    """Rows of the run catalog, -1 for a false star."""
+    """Row of the run catalog for each star (n,), -1 for a false star."""
 
 
 # The sky as it is at one time and place, whatever a run catalog says of it.
@@ -150,7 +150,7 @@ class BatchScene:
     missing_share: float = 0.0
 
     def look(self, attitude: Matrix, most: int) -> tuple[Matrix, list[Seen]]:
-        """Up to `most` stars per tracker; the attitude is moved until some tracker has a star.
+        """An attitude, moved until a tracker sees a star, and the stars seen, at most `most` each.
 
         A spacecraft with a fixed pole only rolls for that.
         """
@@ -261,7 +261,7 @@ def shaken(direction: Vector, sigma_rad: float, rng: np.random.Generator) -> Vec
 
 IMAGE_SIGMA_SAMPLES = 1.2
 LIGHT_OVER_NOISE = 300.0
-"""Ratio of the summed samples of a `LIGHT_AT_MAG` star to the noise of one sample."""
+"""Ratio of a star's summed samples at magnitude `LIGHT_AT_MAG` to the noise of one sample."""
 LIGHT_AT_MAG, FAINTEST_MAG = 5.0, 7.5
 FULL_SHARE = 0.8
 MOST_STEPS_OFF = 2.0
@@ -275,7 +275,7 @@ def readings(
     magnitude_mag: float,
     rng: np.random.Generator,
 ) -> dict[str, Any] | None:
-    """Simulated readings of a scanning tracker for one star, with noise.
+    """Simulated noisy readings of a scanning tracker for one star; None if the scan gives none.
 
     `direction` (3,) is in tracker axes, at the star's time; a sweep begins then, and the body turns
     on with `rates_rad_per_s` (3,), about the tracker's axes.  None if the scan does not reach the

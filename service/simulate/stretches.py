@@ -69,7 +69,7 @@ USUAL_STARS = 5
 
 
 def usual_stars(mission: Mission) -> int:
-    """Greatest number of stars that a mission's tracker reports; for a camera its own limit."""
+    """Largest number of stars that a mission's trackers report: their cameras' limit, if any."""
     cameras = [each.camera for each in mission.trackers if each.camera is not None]
     return max((each.most_stars for each in cameras), default=USUAL_STARS)
 

@@ -142,7 +142,7 @@ def outside_zone(mission: Mission, drawn: DrawnBatch) -> bool:
 def _motion(
     mission: Mission, rates: vectors.Vector, cadence_s: float, rng: np.random.Generator
 ) -> Iterable[vectors.Matrix | float]:
-    """Attitude of each batch by its rates, or the roll of a mission with its pole on the Sun."""
+    """Attitude of each batch by its rates, or for a Sun-pointed mission the roll (rad) of each."""
     if isinstance(mission.zone, Band):
         steps_rad = np.radians(rates @ mission.axis_body) * cadence_s
         rolls_rad: list[float] = (
@@ -156,7 +156,7 @@ def _motion(
 def _on_the_sun(
     scene: BatchScene, sun: vectors.Vector, roll_rad: float, limit: float, most: int
 ) -> tuple[vectors.Matrix, vectors.Matrix, list[Seen]]:
-    """Attitude with a pole near the Sun; a priori attitude with the pole on it and any roll."""
+    """Attitude with a pole near the Sun, an a priori one with it on the Sun, and the stars seen."""
     rng, stretch, axis = scene.rng, scene.stretch, scene.mission.axis_body
     tilt_deg = rng.uniform(0.0, limit)
     if stretch.kind == "attitude_error":
@@ -173,7 +173,7 @@ def _on_the_sky(
     limit: float,
     most: int,
 ) -> tuple[vectors.Matrix, vectors.Matrix, list[Seen]]:
-    """Any attitude and an erroneous a priori one: attitude = R1(psi) R2(theta) R3(phi) prior."""
+    """A batch's attitude, an a priori one with an error about each axis, and the stars seen."""
     rng, stretch = scene.rng, scene.stretch
     attitude, seen = scene.look(attitude, most)
     angles = rng.uniform(-limit, limit, 3)
@@ -186,7 +186,7 @@ def _on_the_sky(
 
 
 def _as_sent(attitude: vectors.Matrix) -> vectors.Matrix:
-    """Attitude after rounding its quaternion as sent."""
+    """Attitude matrix after rounding its quaternion as in the batch sent."""
     return vectors.matrix_from_quaternion(
         vectors.unit(np.round(vectors.quaternion_from_matrix(attitude), 10))
     )
@@ -331,8 +331,7 @@ class GyroWanted:
 def with_gyro(
     drawn: Iterable[DrawnBatch], mission: Mission, wanted: GyroWanted, duration_s: float, seed: int
 ) -> Iterator[DrawnBatch]:
-    """Add gyro blocks to the batches of a pass of a known duration, each with the blocks ended by
-    then.
+    """Add gyro blocks to the batches of a pass, to each those that have ended by then.
 
     Raises `BadInput` for a mission that does not describe its gyro.
     """
@@ -391,7 +390,7 @@ class _Gyro:
         self._start = parse_utc(first.truth["time"])
 
     def turn(self, before: DrawnBatch, after: DrawnBatch) -> None:
-        """Sample the rotation from one batch to the next."""
+        """Sample the body's rotation from one batch to the next, as the gyro does."""
         quaternions = np.array([each.truth["quaternion"] for each in (before, after)])
         times = [parse_utc(each.truth["time"]).tai_ns for each in (before, after)]
         assert self._start is not None
@@ -419,12 +418,12 @@ class _Gyro:
         )
 
     def full_blocks(self) -> list[dict[str, Any]]:
-        """Blocks finished since the last call."""
+        """Gyro blocks finished since the last call."""
         blocks, self._blocks = self._blocks, []
         return blocks
 
     def rest(self) -> list[dict[str, Any]]:
-        """Finish and return the last block."""
+        """Finish the last gyro block, and return it with all not returned yet."""
         self._end_block()
         return self.full_blocks()
 

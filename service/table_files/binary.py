@@ -107,7 +107,7 @@ _DAY_NS = DAY_S * 10**9
 _J2000_MJD = 51_544
 _FORMATS = {"number": ("D", ">f8"), "integer": ("K", ">i8"), "flag": ("L", "S1")}
 _NAMES = {"time": "UTC"}
-"""Renamed columns, since FITS ignores case and reserves the name for another use."""
+"""New names of columns in FITS, which ignores case and reserves the old ones."""
 _UNITS = {"ppm": "10**-6", "1": "", "1/h": "h**-1"}
 """FITS notation of units that FITS does not know by name."""
 _TIME = Column("TIME", unit="s", description="Terrestrial Time since MJDREFI + MJDREFF.")

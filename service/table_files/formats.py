@@ -1,4 +1,4 @@
-"""Output formats of tables; see `TABLE_FORMATS`.
+"""Output formats of tables, in one registry: `TABLE_FORMATS`.
 
 Everything that names formats derives from it: the parameters `format` of the API, their
 media types in the OpenAPI document, the links of the console, `acquire history --format`

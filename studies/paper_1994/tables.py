@@ -343,8 +343,7 @@ def _ms(values: Sequence[float]) -> str:
 
 
 def proportion_rows(table: int, case: Times, zones: Sequence[ZoneTime]) -> list[Row]:
-    """Result rows of Table 13 or 14: one zone if all are alike, else those of fewest and most
-    stars.
+    """Result rows of Table 13 or 14: of one zone, or of those with the most and fewest stars.
 
     The bound is that of equations 1 and 2.
     """

@@ -100,10 +100,10 @@ def overlap(image: Array, reference: Array) -> float:
 
 
 def search_by_axes(image: Array, reference: Array, rounds: int = 2) -> tuple[float, float]:
-    """Displacement (u, v) by a search along one axis to a peak, then along the other (Fig. 3-3).
+    """Displacement (u, v) of an image by a search for a peak along one axis, then the other.
 
     The search works on crosses, whose bars always overlap; a compact star gives no peak until
-    nearly aligned.  A second round improves the first.
+    nearly aligned.  A second round improves the first (Fig. 3-3).
     """
     _same_shape(image, reference)
     in_u, in_v = np.fft.rfft(reference, axis=1), np.fft.rfft(reference, axis=0)
@@ -160,7 +160,7 @@ def _same_shape(image: Array, reference: Array) -> None:
 
 
 def _polished(turned: npt.NDArray[np.complex128], u: float, v: float) -> tuple[float, float, float]:
-    """Newton iteration to the zero of both derivatives of the correlation; also its value there."""
+    """Place (u, v) of the correlation's peak by Newton's method, and the correlation there."""
     rows, columns = turned.shape
     fu = 2.0 * math.pi * np.fft.fftfreq(columns)[None, :]
     fv = 2.0 * math.pi * np.fft.fftfreq(rows)[:, None]

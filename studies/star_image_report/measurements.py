@@ -175,7 +175,7 @@ WANTED_SIGMA = 0.004
 
 
 def grid_points(side: int) -> tuple[Array, Array]:
-    """Points (n,) of a square grid over -1 ... 1, row by row, in the order of a scan."""
+    """Coordinates (u, v) of a square grid's points over [-1, 1], row by row as in a scan."""
     place = np.linspace(-1.0, 1.0, side)
     return np.tile(place, side), np.repeat(place, side)
 
@@ -325,7 +325,7 @@ def _needed(rows: Array) -> float:
 
 
 def _learned(rng: np.random.Generator, trials: int) -> tuple[float, float, float]:
-    """Ratio of estimated to true variance, and coverage of the 68.3 % bounds of the position."""
+    """Ratio of estimated to true variance; coverages of 68.3 % bounds, learned and assumed."""
     from scipy.stats import t
 
     points = 12

@@ -208,7 +208,7 @@ class AsyncEvents:
                     yield block
 
     def _taken(self, block: Block) -> Event | None:
-        """Event in a block of the stream; None for a block with only a position."""
+        """Event in a block, None for a block without one; raises `EventsLost` for a reset."""
         if block.kind == "reset" and block.id is not None:
             after, self.last = self.last, block.id
             raise EventsLost(after, block.id)
@@ -236,7 +236,7 @@ class AsyncClient(AsyncBatches, AsyncReplays, Runs, Access, Alarms, Calibrations
     def events(
         self, *, run: str | None = None, spacecraft: str | None = None, after: int | None = None
     ) -> AsyncEvents:
-        """Live events from now on, or those after the event of that number.
+        """Live events from now on, or from after the event with the number `after`.
 
         They are followed through lost connections and restarts of the service.  Raises
         `EventsLost` where the service no longer keeps all that were missed, `NoAnswer` where it
