@@ -200,7 +200,7 @@ class Events:
                 yield from reader.feed(piece)
 
     def _taken(self, block: Block) -> Event | None:
-        """Event in a block of the stream; None for a block with only a position."""
+        """Event in a block, None for a block without one; raises `EventsLost` for a reset."""
         if block.kind == "reset" and block.id is not None:
             after, self.last = self.last, block.id
             raise EventsLost(after, block.id)
@@ -228,7 +228,7 @@ class Client(Batches, Replays, Runs, Access, Alarms, Calibrations, Spacecraft, G
     def events(
         self, *, run: str | None = None, spacecraft: str | None = None, after: int | None = None
     ) -> Events:
-        """Live events from now on, or those after the event of that number.
+        """Live events from now on, or from after the event with the number `after`.
 
         They are followed through lost connections and restarts of the service.  Raises
         `EventsLost` where the service no longer keeps all that were missed, `NoAnswer` where it
