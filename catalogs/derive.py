@@ -61,7 +61,7 @@ def hipparcos(table: Mapping[str, npt.NDArray[Any]]) -> Rows:
 
 
 def bigsky(table: Mapping[str, npt.NDArray[Any]]) -> Rows:
-    """The rows of bigsky.
+    """Catalog rows from the columns of the package bigsky, without parallaxes.
 
     Its parallaxes outside Hipparcos are those of Tycho, uncertain by some
     30 mas, and are left out.

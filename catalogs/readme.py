@@ -105,7 +105,7 @@ def readme(
     disagreeing: int,
     notices: Mapping[Package, str],
 ) -> str:
-    """The page of a catalog that was just built."""
+    """Markdown page about a catalog that was just built: counts, sources and licences."""
     hip = catalog.hip > 0
     v = catalog.magnitude_v_mag
     counts = [

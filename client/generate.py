@@ -188,7 +188,7 @@ def described_type(alias: Any) -> Any:
 
 
 def class_text(record: type[Record]) -> str:
-    """Generate the text of a model's class."""
+    """Python text of the client's class for one of the service's records."""
     parent = record.__base__
     is_derived = parent not in (Record, base.Items)
     name = client_name(record)

@@ -62,7 +62,7 @@ GUESS_SHARE = 0.25
 REFINED_POINTS = 200
 LEAST_SIDE_PX = 100
 MIDDLE_SHARES = (1.0 / 3.0, 0.5, 0.25)
-"""Shares of a wide picture's sides whose middle is solved by itself."""
+"""Shares of a wide picture's sides that the middle part has which is solved by itself."""
 CHANGED_TRIALS = 16
 """Number of changed versions of a picture that may be tried, by which odds are judged."""
 LEAST_FAR_SHARE = 0.5

@@ -78,7 +78,7 @@ class Path(StrEnum):
     LOST_IN_SPACE = "lost_in_space"
     """A search of the whole sky: no a priori attitude was given, or its use was disabled."""
     MEASURED = "measured"
-    """A tracker measured the attitude itself, without a search for stars."""
+    """No search for stars: a tracker measured the attitude itself."""
     ZONE_THEN_LOST_IN_SPACE = "zone_then_lost_in_space"
     """The a priori attitude gave no good result, and the whole sky was searched."""
 

@@ -56,7 +56,7 @@ class StepTimer:
         self.begin()
 
     def begin(self) -> None:
-        """Start timing now, ignoring the time before."""
+        """Start the timer of the next step now, so that the time before counts for none."""
         self._last = perf_counter_ns()
 
     def end(self, step: str) -> None:

@@ -69,7 +69,7 @@ class TimedColumns:
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
-        """The columns of several parts, concatenated."""
+        """The columns of several tables one after another, in one table."""
         columns = (each.name for each in fields(cls))
         return cls(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in columns})
 
@@ -171,7 +171,7 @@ _NUMBERS = {"i": np.int64, "u": np.int64, "f": np.float64}
 
 
 def packed(samples: DefinitiveSamples | MeasuredInnovations) -> bytes:
-    """Samples or innovations as compressed bytes."""
+    """Compressed bytes of attitude samples or innovations, the reverse of unpacking them."""
     parts = []
     for name, kind, _ in _FIELDS[type(samples)]:
         values = np.asarray(getattr(samples, name)).T

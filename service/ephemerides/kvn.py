@@ -10,7 +10,7 @@ TIME_SYSTEM = "UTC"
 
 
 def kvn(pairs: Pairs) -> str:
-    """Format pairs as KVN, one line each."""
+    """Text of pairs in keyword-value notation (KVN), one line each."""
     width = max((len(key) for key, _ in pairs if key != "COMMENT"), default=0)
     return "".join(
         f"COMMENT {value}\n" if key == "COMMENT" else f"{key:{width}} = {value}\n"

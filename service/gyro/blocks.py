@@ -50,7 +50,7 @@ class GyroBlock:
 
     @property
     def fingerprint(self) -> str:
-        """A digest of the block's content.
+        """A digest of a gyro block's content, from its names, times and rates.
 
         White space, the order of keys and the format of times do not change it.
         """

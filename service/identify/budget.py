@@ -11,9 +11,9 @@ Batches of a few stars take some thousands, 250 real stars of one tracker 13 mil
 false points with errors of arc minutes would take far more.
 """
 COMPARISONS_PER_UNIT = 7
-"""Comparisons of one observed pair with one candidate pair that cost one unit of work."""
+"""Number of comparisons of an observed pair with a candidate pair that cost a unit of work."""
 NODES_PER_UNIT = 14
-"""Nodes of the search for match groups that cost one unit of work."""
+"""Number of nodes of the search for match groups that cost one unit of work."""
 
 
 class WorkBudget:

@@ -282,7 +282,7 @@ class Tracker(Strict):
 
 
 class Mission(Strict):
-    """The fixed settings of a mission."""
+    """The settings of a mission's file: trackers, zone, tests, tolerances and solver."""
 
     retired: ClassVar[bool] = False
     name: Name

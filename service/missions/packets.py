@@ -209,7 +209,7 @@ class PacketGyro(Strict):
     kind: Literal["angle", "rate"] = "angle"
     """Meaning of gyro counts: with `angle` an accumulating counter, whose change gives the rate."""
     scale_deg: tuple[float, float, float]
-    """Degrees per count about each axis; degrees per second for `rate`."""
+    """Factors (3,) from gyro counts to degrees about each axis; to deg/s for `rate`."""
     counter_bits: int = Field(default=16, ge=2, le=64)
     """Number of bits after which an accumulated angle overflows to zero."""
     max_gap_s: float = Field(default=10.0, gt=0, le=3600)
@@ -233,7 +233,7 @@ class PacketGyroBlocks(Strict):
     kind: Literal["rate", "angle"] = "rate"
     """Meaning of gyro values: with `angle` an accumulating counter, whose change gives the rate."""
     scale_rad: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """Radians per second per unit about each axis; radians for `angle`."""
+    """Factors (3,) from recorded gyro values to rad/s about each axis; to radians for `angle`."""
     counter_bits: int = Field(default=16, ge=2, le=64)
     """Number of bits after which an accumulated angle overflows to zero."""
     max_gap_s: float = Field(default=10.0, gt=0, le=3600)

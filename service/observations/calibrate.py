@@ -53,7 +53,7 @@ class CorrectedColumns(Struct, frozen=True, eq=False, gc=False):
 
     @classmethod
     def of(cls, corrected: Sequence[CorrectedObservations]) -> "CorrectedColumns":
-        """The columns for a single batch, from the calibrated stars of its trackers."""
+        """The columns of calibrated stars for a single batch, from those of its trackers."""
         return cls(
             tracker_offsets=np.array((0, len(corrected))),
             trackers=[each.tracker for each in corrected],
@@ -66,7 +66,7 @@ class CorrectedColumns(Struct, frozen=True, eq=False, gc=False):
         )
 
     def trackers_of(self, row: int) -> range:
-        """The row numbers of a batch's trackers."""
+        """The row numbers of a batch's trackers among those of all batches."""
         return range(*self.tracker_offsets[row : row + 2].tolist())
 
     def of_batch(self, row: int) -> tuple[CorrectedObservations, ...]:

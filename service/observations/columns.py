@@ -48,7 +48,7 @@ class BatchColumns(Struct, frozen=True, eq=False, gc=False):
 
     @classmethod
     def of(cls, batches: Sequence[ObservationBatch]) -> "BatchColumns":
-        """The columns for a sequence of batches, concatenated."""
+        """Columns with the rates, trackers and stars of a sequence of batches."""
         seen = [each for batch in batches for each in batch.observations]
         return cls(
             batches=batches,

@@ -307,7 +307,7 @@ class JoinedRows(ABC):
 
     @abstractmethod
     def body(self) -> Mapping[str, Any]:
-        """The JSON object made from all collected rows."""
+        """The JSON object of the batch or gyro block made from all collected CSV rows."""
 
     def refuse(self, number: int, fault: Fault) -> None:
         """Refuse all rows for a fault, unless an earlier fault refused them already."""

@@ -223,7 +223,7 @@ class PredictionIn(BaseModel):
     rate: RateSource | None = None
     """The source of the body rates used for the prediction."""
     reason: NoPrediction | None = None
-    """The reason for having no prediction."""
+    """The reason why there is no prediction of the attitude; None if there is one."""
 
     @model_validator(mode="after")
     def _whole(self) -> Self:
@@ -280,7 +280,7 @@ class OptionsIn(Wire):
     zone_grid_deg: Annotated[GridStep, Field(strict=True)] | None = None
 
     def to_options(self) -> Options:
-        """The options as the solver takes them."""
+        """A batch's sent options as the solver takes them."""
         return Options(
             identifier=self.identifier,
             solver=self.solver,
@@ -432,7 +432,7 @@ class BatchIn(Wire):
 
 
 def prior_of(prior: APrioriIn) -> APriori:
-    """A priori knowledge as the solver takes it, for no batch; raises `BadBatch` for the last."""
+    """A priori knowledge of no batch as the solver takes it; raises `BadBatch` for "last"."""
     known = prior_from_canonical(prior.model_dump_json(exclude_defaults=True))
     if known is None:
         raise BadBatch(Fault("a_priori.from", "is for batches alone", shown_value("last")))
@@ -507,12 +507,12 @@ def submission_from_json(body: bytes | str, run: str | None = None) -> Submissio
 
 
 def submission_from_model(model: BatchIn) -> Submission:
-    """The submission for a validated model of a batch."""
+    """The submission made from a validated model of a batch."""
     return submission_from_checked(checked_from_model(model))
 
 
 def submission_from_checked(checked: Checked) -> Submission:
-    """The submission for a batch in canonical form."""
+    """The submission of a checked batch, decoded from its canonical JSON."""
     return Submission(batch_from_canonical(checked.text), checked.text, checked.fingerprint)
 
 

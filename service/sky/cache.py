@@ -15,7 +15,7 @@ from typing import Generic, Protocol, TypeVar
 from service.errors import BeingBuilt
 
 BUILDS_AT_ONCE = 2
-"""Largest number of cached objects built at a time; a build may take many times its result."""
+"""Largest number of objects built at a time; each may take many times its result's memory."""
 
 
 class Sized(Protocol):

@@ -44,7 +44,7 @@ class Table:
 
     @property
     def names(self) -> list[str]:
-        """Names of the columns, in order."""
+        """Names of the table's columns, in order."""
         return [each.name for each in self.columns]
 
 

@@ -84,7 +84,7 @@ class Setting:
 
 @dataclass(frozen=True)
 class Sweep:
-    """A swept setting with its values."""
+    """A setting of a simulation, with the values over which it is swept."""
 
     name: str
     values: tuple[float, ...]

@@ -85,7 +85,7 @@ class Case:
 
     @property
     def conditions(self) -> Conditions:
-        """Condition in the form of the scene simulator."""
+        """The compared condition as conditions of the scene simulator."""
         return Conditions(
             position_px=self.position_px,
             magnitude_sigma_mag=self.magnitude_sigma_mag,

@@ -64,7 +64,7 @@ class Study:
         return np.random.default_rng([self.seed, row])
 
     def trials(self, full: int) -> int:
-        """Size of a sample, a tenth if quick."""
+        """Number of trials: `full`, or in a quick check a tenth of it, but at least 200."""
         return max(full // 10, 200) if self.quick else full
 
     def slack(self, trials: int, bound: float) -> float:

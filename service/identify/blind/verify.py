@@ -24,7 +24,7 @@ Rows = npt.NDArray[np.int64]
 
 GATE_SIGMAS = 3.5
 LEAST_SIGMA_PX = 0.15
-"""Least position sigma in pixels, before residuals show the actual errors."""
+"""Least sigma in pixels of a picture's points, before residuals show the actual errors."""
 FAINTEST_SHARE = 2.5
 """Number of catalog stars tried per point of a picture, as clutter and gaps shift the limit."""
 LEAST_STARS, MOST_STARS = 12, 400
@@ -36,9 +36,9 @@ LEAST_MATCHES = {FREE_SCALE: 4, SCALE_BEND: 7, SCALE_CENTER: 12}
 HOPELESS_LOG_ODDS = 0.0
 """Log odds after two rounds below which a hypothesis is dropped; chance stays below -5."""
 CROWD = 6
-"""Least number of matches for each lens model in a refinement at a known attitude."""
+"""Number of nearest points that measure the crowding of a place."""
 LEAST_REFINED = {FREE_SCALE: 4, SCALE_BEND: 6, SCALE_CENTER: 8}
-"""Least number of matches for each lens model once the attitude is known."""
+"""Least number of matches for each lens model in a refinement at a known attitude."""
 
 
 @dataclass(frozen=True)

@@ -14,13 +14,13 @@ LEAST_PAIR_RAD = 0.006
 TYPICAL_REACH_RAD = 0.07
 """Typical distance of the other points of a field from a pair."""
 CHORD_OF_LONGEST = 0.999
-"""Error of a star's place from the cell size of a sky bitmap, in radians."""
+"""Ratio of the chord to the arc of 8 degrees, rounded down."""
 CELL_RAD = 2.5e-3
-"""Error of a star's place from the cell size of a bitmap."""
+"""Error of a star's place from the cell size of a sky bitmap, in radians."""
 EXACT_COST = 2.0
 """Cost of comparing a candidate with the exact place of one more point, in candidates."""
 PRIOR_COST = 40.0
-"""Fixed cost of trying a pair, in units of one candidate."""
+"""Fixed cost of trying a pair of points, in units of examining one candidate."""
 RANK_COST = 0.15
 """Relative increase of a pair's cost per rank of its points, as fainter ones are less useful."""
 USE_COST = 3.0

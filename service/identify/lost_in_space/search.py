@@ -56,9 +56,9 @@ Later tries rotate among all points, since the bright ones may all be false.
 MAX_PREFILTERED = 12
 """Largest number of further points that bitmaps and exact places test for a candidate."""
 REFINE_WORK = 60
-"""Work of refining a candidate, in units of one candidate."""
+"""Work of refining a candidate attitude, in units of examining one."""
 MAX_WORK = 600_000
-"""Work limit of a search in candidates, about 30 ms."""
+"""Work limit of a search of the whole sky, in examined candidates: about 30 ms."""
 ACCEPT_LOG = 7.5
 ACCEPT_LOG_PER_CLUTTER = 0.5
 """Additional log evidence per unexplained point that is needed to end the search."""

@@ -18,9 +18,9 @@ Integers = npt.NDArray[Any]
 MAX_EDGES = 1 << 18
 """Largest number of surviving pairs for which groups are searched; beyond, all votes count."""
 MAX_WORK = 50_000_000
-"""Work limit of one search in nodes visited, about a quarter of a second."""
+"""Work limit of a search for match groups in nodes visited, about a quarter of a second."""
 MAX_HELD = 1 << 22
-"""Largest number of nodes held at one time."""
+"""Largest number of nodes in memory at one time, in a search for match groups."""
 
 
 def keep_largest_groups(
@@ -52,7 +52,7 @@ def keep_largest_groups(
 
 @njit(nogil=True)
 def _largest(star, start, neighbour, member, work):  # type: ignore[no-untyped-def]
-    """The size of the largest match groups, and the remaining work.
+    """The number of stars in the largest match groups, and the work that remains allowed.
 
     `member` is set to mark the nodes in one of the groups.
 

@@ -59,7 +59,7 @@ class CentroidRecord:
 
     @property
     def usable(self) -> bool:
-        """True if a centroid was found."""
+        """True if a centroid of the star was found, with flags or without."""
         return self.refused is None
 
 

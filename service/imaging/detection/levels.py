@@ -37,7 +37,7 @@ class CountLevels:
         return self.zero_counts == 0.0 and self.factor == 1.0
 
     def scaled(self, counts: CountArray) -> CountArray:
-        """The counts after scaling, in single precision."""
+        """Counts less the zero level, times the factor, in single precision."""
         if self.is_as_it_is:
             return np.array(counts, dtype=np.float32)
         with np.errstate(invalid="ignore"):

@@ -38,7 +38,7 @@ LEAST_PSF_PX, MOST_PSF_PX = 0.7, 5.0
 SURROUND = 3.0
 """Width of the subtracted surroundings in the filter, in widths of a star's image."""
 FILTER_REACH = 4.0
-"""Radius at which the filter ends, in widths of its surroundings."""
+"""Radius at which the detection filter ends, in widths of its subtracted surroundings."""
 STRIP_ROWS = 256
 MAX_WORKING_PIXELS = 4_000_000
 """Largest number of pixels processed unbinned; binning makes star images narrower."""

@@ -40,7 +40,7 @@ class Entry(NamedTuple):
 
     @property
     def size_bytes(self) -> int:
-        """The size in bytes of all numbers of a tag."""
+        """The size in bytes of all numbers of a TIFF tag, also of an unknown kind."""
         known = self.kind < len(_TYPE_BYTES)
         return self.number * (_TYPE_BYTES[self.kind] if known else 8)
 

@@ -16,7 +16,7 @@ from service.errors import BadFile, Fault, shown_value
 FAULTS_SHOWN = 20
 MAX_ID_LENGTH = 64
 LEAST_JUDGED = 100
-"""Least number of stars whose range of places tells their unit."""
+"""Least number of stars by whose range of places a wrong unit is recognised."""
 FIRST_EPOCH, LAST_EPOCH = 1800.0, 2100.0
 """Earliest and latest Julian year of a position's epoch."""
 

@@ -5,7 +5,7 @@ import numpy as np
 from service.vectors import ARCSEC_PER_RADIAN, Vector
 
 REACH_ARCSEC = 3600.0
-"""Largest distance of a neighbour, in arcsec."""
+"""Largest distance in arcsec at which the nearest star counts as a neighbour."""
 RIVAL_FAINTER_BY_MAG = 2.0
 """Largest number of magnitudes by which a rival neighbour may be fainter than the star."""
 

@@ -44,9 +44,9 @@ EVERY_S = 60.0
 MOST_LEAVES = 2_000
 """Approximate number of leaves of one head; further ones go to the next, in a new transaction."""
 ADOPTED_AT_ONCE = 500
-"""Results of earlier versions that get a leaf in one transaction."""
-_HOUR = len("2026-03-01T12")
 """Number of results of earlier versions that get a leaf of the chain in one transaction."""
+_HOUR = len("2026-03-01T12")
+"""Length of a time's text up to its hour; the first head of each hour is sent as an event."""
 LATE_S = 3_600.0
 """Longest duration in seconds of a transaction that adds a row to a bound table."""
 

@@ -43,10 +43,10 @@ class RetiredMission(Mission):
 
 @dataclass(frozen=True)
 class Retired:
-    """Recorded spacecraft and trackers that no mission file describes any more."""
+    """Spacecraft and trackers with recorded data that no mission file describes any more."""
 
     missions: dict[str, Mission] = field(default_factory=dict)
-    """Spacecraft and trackers with recorded data that no mission file describes any more."""
+    """Last settings of each retired spacecraft that has batches, by name."""
     trackers: dict[str, tuple[str, ...]] = field(default_factory=dict)
     """Trackers in earlier settings of a spacecraft but not in its last ones, by spacecraft."""
 

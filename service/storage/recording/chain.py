@@ -38,7 +38,7 @@ class Statement(msgspec.Struct, frozen=True, kw_only=True):
     previous: str
     """SHA-256 of the statement of the head before in hexadecimal digits; empty in the first one."""
     made: str
-    """UTC at which the head was made."""
+    """UTC at which the head of the record was made."""
     first: int
     """Lowest place of a result with a leaf; negative: recorded before there was a chain."""
     last: int

@@ -195,7 +195,7 @@ def _by_key(dialect: Dialect) -> str:
 
 BYTES = 8
 SETTINGS = (tables.missions, tables.catalogs, tables.mission_uses)
-"""Tables of mission settings and catalogs, whose rows each hold a digest (`row_digest`)."""
+"""Tables of mission settings, their uses, and catalogs; each row has a digest (`row_digest`)."""
 _NO_CONTENT = ("results.current", "results.seq", "results.digest", "mission_uses.id")
 """Columns that digests leave out: those that change, give an order, or hold a digest."""
 

@@ -278,7 +278,7 @@ class OlderDigests:
     store: Store
 
     def waiting(self) -> bool:
-        """True if any digest is missing."""
+        """True if the digest of any result, or of any row of `SETTINGS`, is missing."""
         with self.store.reading_record() as connection:
             return any(
                 connection.execute(select(column).where(digest.is_(None)).limit(1)).first()

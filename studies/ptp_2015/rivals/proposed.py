@@ -31,7 +31,7 @@ class Algorithm(Protocol):
 
     @property
     def entries(self) -> int:
-        """Number of rows in the database."""
+        """Number of rows in the algorithm's database."""
         ...
 
     @property
