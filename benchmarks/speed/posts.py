@@ -30,17 +30,17 @@ from benchmarks.report import Report
 from benchmarks.speed.load import Driven, drive, get, request
 from benchmarks.speed.serving import START_S, Served, no_op, service
 from service.app.factory import open_app
-from service.missions.mission import load_missions
+from service.missions.mission import CAP_START, load_missions
 from service.observations.schema import submission_from_json
 from service.settings import Settings
-from service.simulate.stretches import DEFAULT_START, NO_TROUBLES, Pass
+from service.simulate.stretches import NO_TROUBLES, Pass
 from service.simulate.telemetry import DrawnBatch, draw_pass
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
 
 API = "/api/v1"
-FIRST = datetime.fromisoformat(DEFAULT_START)
+FIRST = datetime.fromisoformat(CAP_START)
 CONNECTIONS = 16
 POSTS, QUICK_POSTS = 2_000, 800
 """Posts of one turn: few, so that a server and its no-op meet an equal load."""

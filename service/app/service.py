@@ -3,7 +3,8 @@
 import gc
 import logging
 import threading
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
+from dataclasses import replace
 
 from msgspec import structs
 
@@ -16,11 +17,10 @@ from service.app.single_projector import SingleProjector
 from service.contract.events import RecordHead
 from service.contract.spacecraft import About, CatalogAbout, MissionAbout
 from service.errors import AcquisitionError, Busy
-from service.ingest.solver_pool import mission_in_input
 from service.ingest.submit import SubmissionService
 from service.missions.identifiers import IDENTIFIERS
-from service.missions.mission import Mission
-from service.observations.schema import submission_from_json
+from service.observations.schema import Submission, submission_from_json
+from service.sky.cache import LruCache
 from service.storage.projections.heads import require_head
 from service.storage.queries.fleet import latest_inputs
 from service.storage.recording import events
@@ -28,7 +28,7 @@ from service.storage.recording.events import Event
 from service.storage.recording.ids import Ulids
 from service.storage.upkeep.expiries import ExpiryDates
 from service.storage.upkeep.split_trackers import BackgroundUpgrade
-from service.times import Utc, utc_now
+from service.times import Utc, parse_utc, utc_now
 
 log = logging.getLogger(__name__)
 
@@ -100,7 +100,7 @@ class Service:
                     self._context.missions, self._begin_with_zones, self._go_on_with_whole_sky
                 )
         prewarm_kernels(self._context.sky, self._context.missions)
-        self._prewarm_sky(self._context.missions.values(), utc_now())
+        self._prewarm_sky()
         self._become_warm()
         if self._kernels is not None:
             # Only a service does this by itself, not a command.
@@ -113,22 +113,36 @@ class Service:
         """Load the kernels of batches with a zone, and accept such batches."""
         in_zones = [name for name, entry in IDENTIFIERS.items() if entry.searches_zone]
         prewarm_kernels(self._context.sky, self._context.missions, in_zones)
-        self._prewarm_sky(self._context.missions.values(), utc_now())
+        self._prewarm_sky()
         self._become_warm()
         log.info("ready for batches with an a priori attitude; still compiling other kernels")
 
     def _go_on_with_whole_sky(self) -> None:
         """Load the kernels of whole-sky searches, and build their catalogs."""
         prewarm_kernels(self._context.sky, self._context.missions)
-        self._prewarm_sky(self._context.missions.values(), utc_now(), whole_sky=True)
+        self._prewarm_sky(whole_sky=True)
         log.info("ready for batches that need the whole sky; still compiling other kernels")
 
-    def _prewarm_sky(self, missions: Iterable[Mission], time: Utc, whole_sky: bool = False) -> None:
-        """Build catalogs and zones of missions; for the whole sky if asked or its kernels exist."""
+    def _prewarm_sky(self, *, whole_sky: bool = False) -> None:
+        """Build catalogs of all missions; also for the whole sky if its kernels exist.
+
+        They are of the present epoch, of the latest batches, and in a server of simulated
+        telemetry, so that no such batch waits while a file is built.
+        """
+        sky, now = self._context.sky, utc_now()
+        # The files of other epochs displace no zones in memory before a batch opens them.
+        files = replace(sky, cache=LruCache(1))
+        times: dict[str, list[Utc]] = {name: [] for name in self._context.missions}
+        for sent in self._latest_batches():
+            times[sent.batch.spacecraft].append(sent.batch.time)
         whole_sky |= self._kernels is None or not self._kernels.whole_sky_needed
-        for mission in missions:
+        for mission in self._context.missions.values():
+            if self._kernels is not None:
+                times[mission.name].append(parse_utc(mission.simulated_start))
             try:
-                prewarm_sky(self._context.sky, [mission], time, whole_sky)
+                for time in times[mission.name]:
+                    prewarm_sky(files, [mission], time, whole_sky)
+                prewarm_sky(sky, [mission], now, whole_sky)
             except AcquisitionError as error:
                 # Only batches of this mission are refused then; no other mission waits for it.
                 log.warning("the sky of %s cannot be built: %s", mission.name, error)
@@ -163,19 +177,28 @@ class Service:
         The latest batch of each is processed again under a new id and rolled back; with few
         spacecraft several times, because code runs slowly at first.
         """
-        with self._context.reading_record() as connection:
-            inputs = latest_inputs(connection, self._context.missions, utc_now())
-        for text in inputs:
+        batches = self._latest_batches()
+        for sent in batches:
             try:
-                sent = submission_from_json(text)
-                mission = mission_in_input(self._context.missions, sent.batch.spacecraft)
-                self._prewarm_sky([mission], sent.batch.time)
-                for _ in range(1 + WARM_UP_RUNS // len(inputs)):
+                for _ in range(1 + WARM_UP_RUNS // len(batches)):
                     batch = structs.replace(sent.batch, batch=self._ids.new())
                     self._submissions.warm_up(structs.replace(sent, batch=batch))
             except Exception as error:
                 # A batch that no longer runs must not prevent the start.
                 log.warning("the latest batch of a spacecraft could not be run again: %s", error)
+
+    def _latest_batches(self) -> list[Submission]:
+        """Latest batch of each live spacecraft, as far as it can be read."""
+        with self._context.reading_record() as connection:
+            inputs = latest_inputs(connection, self._context.missions, utc_now())
+        batches = []
+        for text in inputs:
+            try:
+                batches.append(submission_from_json(text))
+            except AcquisitionError as error:
+                # A batch that is refused today must not prevent the start.
+                log.warning("the latest batch of a spacecraft could not be read again: %s", error)
+        return batches
 
     def about(self, spacecraft: Collection[str] | None = None) -> About:
         """Description of the service: version, catalog, missions and database."""

@@ -66,6 +66,12 @@ def _zero_or_wide(step_deg: float) -> float:
     return step_deg
 
 
+CAP_START = "1999-03-01T00:00:00.000Z"
+"""Start of simulated telemetry with a cap, when XTE and SWAS were both operating."""
+BAND_START = "1996-04-16T00:00:00.000Z"
+"""Start of simulated telemetry with a band, at the end of SOHO's commissioning.  In mid January and
+mid July its band crosses Carina, where stars are densest and a few in ten thousand are confused.
+"""
 LEAST_GRID_DEG = 0.01
 GridStep = Annotated[float, Field(ge=0, le=10), AfterValidator(_zero_or_wide)]
 if TYPE_CHECKING:
@@ -401,6 +407,11 @@ class Mission(Strict):
             return max(self.zone.half_width_deg - field_deg, 0.0)
         # Errors about the two axes perpendicular to the boresight add.
         return max(self.zone.radius_deg - field_deg, 0.0) / math.sqrt(2.0)
+
+    @property
+    def simulated_start(self) -> str:
+        """Default start of simulated telemetry, whose files of the sky a first start builds."""
+        return BAND_START if isinstance(self.zone, Band) else CAP_START
 
     @cached_property
     def axis_body(self) -> Vector:

@@ -11,12 +11,6 @@ from service.observations.batch import MAX_STARS_PER_TRACKER, Aberration
 PriorKind = Literal["quaternion", "direction", "mixed", "none"]
 Kind = Literal["nominal", "attitude_error", "spurious", "magnitude_error", "position_error"]
 
-DEFAULT_START = "1999-03-01T00:00:00.000Z"
-"""Default start of a pass with a cap, when XTE and SWAS were both operating."""
-BAND_START = "1996-04-16T00:00:00.000Z"
-"""Default start of a pass with a band, at the end of SOHO's commissioning.  In mid January and mid
-July its band crosses Carina, where stars are densest and a few in ten thousand are confused.
-"""
 CAP_CADENCE_S, BAND_CADENCE_S = 30.0, 300.0
 CAP_ATTITUDE_ERROR_DEG, BAND_ATTITUDE_ERROR_DEG = 10.0, 5.0
 
@@ -144,8 +138,7 @@ class Pass:
 
     def start_of(self, mission: Mission) -> str:
         """Time of the first batch of the pass."""
-        default = BAND_START if isinstance(mission.zone, Band) else DEFAULT_START
-        return default if self.start is None else self.start
+        return mission.simulated_start if self.start is None else self.start
 
     def cadence_of(self, mission: Mission) -> float:
         """Seconds from one batch to the next."""

@@ -6,6 +6,7 @@ import threading
 import time
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 from threading import get_ident
 
@@ -215,6 +216,28 @@ def test_it_is_ready_for_zones_while_other_kernels_are_compiled(make, monkeypatc
     assert not app.service.being_compiled()
     assert not asyncio.run(app.submissions.answered(json.dumps(lost).encode())).replayed
     app.close()
+
+
+def test_no_batch_of_simulated_telemetry_or_of_the_last_epoch_waits_for_a_file_of_the_sky(
+    make, missions, monkeypatch, tmp_path
+):
+    """A server that starts without files of the sky builds these before it is ready."""
+    settings = Settings(database=f"sqlite:///{tmp_path}/served.db", replay_processes=0)
+    with closing(open_app(settings, serving=True)) as app:
+        app.submissions.submit(make("recorded"))
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(
+        KernelBuild, "run", lambda build, missions, *built: built[0]() or built[1]()
+    )
+    with closing(open_app(settings, serving=True)) as app:
+        app.service.ready()
+        waits_for = app.submissions.pool.builder
+        monkeypatch.setattr(waits_for, "submit", lambda *_: pytest.fail("a file is built"))
+        times = [json.loads(make().text)["time"], *(m.simulated_start for m in missions.values())]
+        for place, time_utc in enumerate(times):
+            body = json.loads(make(f"lost-{place}").text) | {"time": time_utc, "a_priori": None}
+            answer = app.submissions.submit(submission_from_json(json.dumps(body)))
+            assert json.loads(answer.body)["path"] == "lost_in_space"
 
 
 def test_what_is_asked_after_closing_is_busy(opened, make):
