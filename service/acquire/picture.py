@@ -15,6 +15,7 @@ from service.acquire.picture_remarks import (
     remarks_on,
     remarks_on_light,
 )
+from service.errors import BadInput, Fault, shown_value
 from service.identify.blind.lens import (
     PROJECTIONS,
     Lens,
@@ -28,6 +29,7 @@ from service.identify.blind.solver import (
     BlindResult,
     BlindSolver,
     FocalRange,
+    focal_px_of,
     least_log_odds,
     rotation_between,
 )
@@ -74,6 +76,8 @@ Nine real pictures have at most .0005, simulated ones with seven or more stars .
 scaled by residuals: for chance matches, or a lens whose axis was cropped away, they are .004 and
 more.
 """
+WIDEST_PLAIN_DEG = 120
+"""Field of view in degrees that no plain (gnomonic) lens has."""
 ENOUGH_FREEDOM = 10
 """Degrees of freedom from which residuals may also reduce the sigmas."""
 
@@ -256,6 +260,20 @@ def solve_picture(
                 return replace(found, remarks=(remark, *found.remarks))
     points = tried[min(1, len(tried) - 1)]
     return replace(result, points=points, remarks=tuple(advice_on(points, frame, guess_px)))
+
+
+def focal_px_of_field(
+    side_px: int, field_deg: float, projection: Projection | None, field: str
+) -> float:
+    """Focal length in pixels at which a picture's longer side spans a field of view.
+
+    Raises `BadInput` naming `field` for a field too wide for a plain lens.
+    """
+    projection = projection or "gnomonic"
+    if projection == "gnomonic" and field_deg >= WIDEST_PLAIN_DEG:
+        message = f"must be below {WIDEST_PLAIN_DEG} degrees, unless a lens of a fisheye is named"
+        raise BadInput(Fault(field, message, shown_value(field_deg)))
+    return focal_px_of(side_px, field_deg, projection)
 
 
 def _solved_part(

@@ -345,6 +345,16 @@ def positive(text: str) -> float:
     return number
 
 
+def add_object(parser: argparse.ArgumentParser) -> None:
+    """Add the option `--object`, for files with the attitudes of several objects."""
+    parser.add_argument(
+        "--object",
+        metavar="ID",
+        help="the object whose attitudes the file gives: its name, or the NAIF id of a structure "
+        "of a C-kernel, which must be chosen where the kernel has several",
+    )
+
+
 def degrees(text: str) -> float:
     """Parse a field of view in degrees, above 0 and at most 180, for an option."""
     number = positive(text)

@@ -8,6 +8,7 @@ leap-second kernel is given.
 
 import json
 import lzma
+import re
 import subprocess
 import sys
 import zipfile
@@ -18,7 +19,7 @@ import numpy as np
 
 from service.ephemerides import known
 from service.ephemerides.text_kernels import leap_second_kernel
-from service.errors import BadFile, Fault
+from service.errors import BadFile, BadInput, Fault, shown_value
 from service.extras import require_extra
 from service.table_files.spool import PIECE_BYTES, folder
 from service.vectors import attitude_matrices
@@ -36,11 +37,16 @@ _KERNELS = (".tsc", ".tls")
 """Suffixes of clock and leap-second kernels, needed to read a C-kernel."""
 
 
-def read_ck(file: Path, field: str = "file") -> known.KnownAttitudes:
+def read_ck(file: Path, field: str = "file", object_id: str | None = None) -> known.KnownAttitudes:
     """Read a C-kernel with its clock kernel next to it, or a zip file with both.
+
+    `object_id` is the NAIF id of the structure that is read from a kernel that orients several.
 
     Raises `BadFile` naming the file, and `NotAvailable` without spiceypy.
     """
+    if object_id is not None and not re.fullmatch(r"-?\d{1,9}", object_id):
+        message = "must be the NAIF id of a structure that a C-kernel orients, such as -82000"
+        raise BadInput(Fault("--object", message, shown_value(object_id)))
     require_extra("spice", "spiceypy", field, file.name)
     with folder() as temporary:
         place = Path(temporary)
@@ -51,7 +57,7 @@ def read_ck(file: Path, field: str = "file") -> known.KnownAttitudes:
         if not any(each.endswith(".tls") for each in others):
             (place / "leap_seconds.tls").write_text(leap_second_kernel(), encoding="ascii")
             others.append("leap_seconds.tls")
-        return _read(file.name, place, kernel, others)
+        return _read(file.name, place, object_id or "", kernel, others)
 
 
 def _linked(file: Path, place: Path) -> tuple[str, list[str]]:
@@ -89,8 +95,11 @@ def _unpacked(file: Path, place: Path) -> tuple[str, list[str]]:
     return found[".bc"][0], [name for suffix in _KERNELS for name in found[suffix]]
 
 
-def _read(name: str, place: Path, kernel: str, others: list[str]) -> known.KnownAttitudes:
-    command = [sys.executable, "-P", str(_CHILD), ".", str(known.MOST_RECORDS), kernel, *others]
+def _read(
+    name: str, place: Path, object_id: str, kernel: str, others: list[str]
+) -> known.KnownAttitudes:
+    command = [sys.executable, "-P", str(_CHILD), ".", str(known.MOST_RECORDS)]
+    command += [object_id, kernel, *others]
     try:
         done = subprocess.run(command, cwd=place, capture_output=True, timeout=CHILD_S, check=False)
     except subprocess.TimeoutExpired:

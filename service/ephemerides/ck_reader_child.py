@@ -1,12 +1,13 @@
 """Program that reads C-kernels of types 1 and 3, run as a child process.
 
-    python ck_reader_child.py OUT MOST CK KERNEL...
+    python ck_reader_child.py OUT MOST STRUCTURE CK KERNEL...
 
 Writes to the folder OUT `records`, rows of nanoseconds of TAI since J2000 (int64), the four
 components of SPICE's quaternion from J2000 and the rates about inertial axes in rad/s, NaN where
 there are none (float64); and `segments`: rows of the first record, the number of records of each
 interval, and 1 where nothing is known between its records.  Intervals are in the order of the
-file: a later one has priority.  Prints a line of JSON: `error`, or the `object`.
+file: a later one has priority.  STRUCTURE is the NAIF id of the structure that is read, empty for
+the only one.  Prints a line of JSON: `error`, or the `object`.
 """
 
 import json
@@ -72,7 +73,7 @@ def from_j2000(frame: int, records: Floats) -> Floats:
 
 def main() -> None:
     """Read a C-kernel named on the command line; write its records and intervals to a folder."""
-    out, most, ck, *kernels = sys.argv[1:]
+    out, most, asked, ck, *kernels = sys.argv[1:]
     for each in (*kernels, ck):
         spice.furnsh(each)
     handle = spice.dafopr(ck)
@@ -80,9 +81,13 @@ def main() -> None:
     if not found:
         raise Refused("has no segment")
     structures = sorted({each[0] for each in found})
-    if len(structures) > 1:
-        raise Refused(f"orients several structures: {', '.join(map(str, structures))}")
-    structure = structures[0]
+    names = ", ".join(map(str, structures))
+    if not asked and len(structures) > 1:
+        raise Refused(f"orients several structures: {names}; choose one with --object")
+    structure = int(asked) if asked else structures[0]
+    found = [each for each in found if each[0] == structure]
+    if not found:
+        raise Refused(f"orients {names}, not {structure}")
     clock = spice.ckmeta(structure, "SCLK")
     try:
         spice.dtpool(f"SCLK_DATA_TYPE_{-clock}")
@@ -114,7 +119,9 @@ def main() -> None:
             file.write(np.column_stack([ns.view(np.float64), rows[:, 1:]]).tobytes())
             count += count_here
     np.array(spans, dtype=np.int64).tofile(Path(out, "segments"))
-    print(json.dumps({"object": str(structure // 1000)}))
+    # The bus of spacecraft SC is usually structure 1000 SC; an instrument has its own id.
+    whole, part = divmod(structure, 1000)
+    print(json.dumps({"object": str(structure if part else whole)}))
 
 
 if __name__ == "__main__":

@@ -41,23 +41,33 @@ READ = (
 """Names of the attitude formats that can be read, for messages."""
 
 
-def read_attitudes(file: Path, field: str) -> KnownAttitudes:
+def read_attitudes(file: Path, field: str, object_id: str | None = None) -> KnownAttitudes:
     """Read attitudes from a file in any format, also packed with gzip.
 
-    Raises `BadInput` naming `field` if the file cannot be opened, and `BadFile` naming file, line
-    and field if the content is invalid.
+    `object_id` is the object whose attitudes are read: its name in a message, or the NAIF id of a
+    structure of a C-kernel.  Raises `BadInput` naming `field` if the file cannot be opened, and
+    `BadFile` naming file, line and field if the content is invalid or of another object.
     """
     with _opened(file, field) as opened:
         start = _start(opened)
-        if not (start.startswith((b"DAF/CK", b"NAIF/DAF")) or zipfile.is_zipfile(file)):
-            if start.startswith(b"{"):
-                return _read_truth(file.name, opened)
-            if is_attitude_csv(start):
-                return read_attitude_csv(file.name, opened)
-            _require_text(file, start, (b"CCSDS_", b"<"), READ)
-            reader = read_acm if _IS_ACM.search(start) else read_aem
-            return reader(file.name, opened)
-    return read_ck(file, field)
+        if start.startswith((b"DAF/CK", b"NAIF/DAF")) or zipfile.is_zipfile(file):
+            return read_ck(file, field, object_id)
+        known = _of_text(file, start, opened)
+    if object_id not in (None, known.object_name):
+        message = f"has the attitudes of {known.object_name}, not of the object asked for"
+        raise BadFile(Fault(file.name, message, shown_value(object_id)))
+    return known
+
+
+def _of_text(file: Path, start: bytes, opened: IO[bytes]) -> KnownAttitudes:
+    """Read attitudes from an open file of text that begins with `start`."""
+    if start.startswith(b"{"):
+        return _read_truth(file.name, opened)
+    if is_attitude_csv(start):
+        return read_attitude_csv(file.name, opened)
+    _require_text(file, start, (b"CCSDS_", b"<"), READ)
+    reader = read_acm if _IS_ACM.search(start) else read_aem
+    return reader(file.name, opened)
 
 
 @contextmanager

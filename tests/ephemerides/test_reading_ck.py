@@ -120,13 +120,24 @@ def test_a_kernel_without_rates_is_read_like_one_with_them(spice_wrote, rates):
         ({"kind": "2"}, "x.bc: has a segment of type 2; types 1 and 3 are read"),
         ({"frame": "ITRF93"}, "x.bc: refers to frame ITRF93; inertial frames of SPICE are read"),
         ({"other": "short"}, "x.bc, record 1: quaternion: must have norm 1 within 0.001"),
-        ({"other": "several"}, "x.bc: orients several structures: -999000, -998000"),
+        ({"other": "several"}, "x.bc: orients several structures: -999000, -998000; choose one"),
     ],
 )
 def test_a_kernel_that_is_not_read_is_refused_by_name(spice_wrote, told, words):
     with pytest.raises(BadFile) as refusal:
         read_attitudes(spice_wrote(**told), "FILE")
     assert words in str(refusal.value)
+
+
+def test_of_several_structures_one_is_chosen(spice_wrote):
+    """`divmod` of a negative id of an instrument gave the next spacecraft."""
+    file = spice_wrote(other="several")
+    known = read_attitudes(file, "FILE", "-999000")
+    assert (known.object_name, len(known)) == ("-999", 5)
+    with pytest.raises(BadFile, match="orients -999000, -998000, not -82000"):
+        read_attitudes(file, "FILE", "-82000")
+    with pytest.raises(BadInput, match=r"--object: must be the NAIF id .* \(got 'CASSINI'\)"):
+        read_attitudes(file, "FILE", "CASSINI")
 
 
 def test_a_kernel_without_its_clock_is_refused_with_what_it_needs(tmp_path):

@@ -77,6 +77,7 @@ def _add_knowledge(parser: ArgumentParser) -> None:
         "or ACM (KVN or XML), a C-kernel, or CSV as `acquire export` writes; batches without one "
         "in the file keep their own",
     )
+    arguments.add_object(parser)
     source.add_argument(
         "--carry-attitude",
         action="store_true",
@@ -230,8 +231,11 @@ def _sources(parsed: Namespace) -> list["FromFile"]:
     from service.replay.items import FileEphemeris, FilePrior
 
     sources: list[FromFile] = []
+    if parsed.object is not None and parsed.a_priori is None:
+        message = "names the object of --a-priori FILE, which is missing"
+        raise BadInput(Fault("--object", message, shown_value(parsed.object)))
     if parsed.a_priori is not None:
-        sources.append(FilePrior(read_attitudes(parsed.a_priori, "--a-priori")))
+        sources.append(FilePrior(read_attitudes(parsed.a_priori, "--a-priori", parsed.object)))
     if parsed.ephemeris is not None:
         sources.append(FileEphemeris(read_ephemeris(parsed.ephemeris, "--ephemeris")))
     return sources

@@ -103,9 +103,9 @@ class DefinitiveDay:
     """Filtered and smoothed attitudes of a day, with counts of the measurements and gyro samples.
 
     `measurements` counts by the names of `kernels.result.Outcome`, and `unusable` and `alone`
-    ones; `gyro` counts samples, gaps, samples beyond the largest rate, and zeros while the body
-    turned.  `nis_per_degree` is the mean of z^T S^-1 z of the accepted measurements per degree of
-    freedom: about 1.
+    ones; `gyro` counts samples, gaps, samples beyond the largest rate, zeros while the body
+    turned, and samples of a gyro that turns the other way.  `nis_per_degree` is the
+    mean of z^T S^-1 z of the accepted measurements per degree of freedom: about 1.
     """
 
     stretches: list[DefinitiveStretch]
@@ -165,6 +165,7 @@ def definitive_day(recorded: Recorded, mission: Mission, day: int) -> Definitive
             "gaps": gaps,
             "beyond_largest": found.beyond_largest,
             "not_given": found.not_given,
+            "reversed": found.reversed,
         },
         nis / degrees if degrees else None,
     )

@@ -22,7 +22,7 @@ from service.gyro.samples import GyroModel, GyroSamples, believed, gyro_samples,
 from service.interpolation import QUARTER_TURN_RAD
 from service.missions.mission import Mission
 from service.missions.motion import GyroSettings, MotionSettings
-from service.vectors import ARCSEC_PER_RADIAN, Vector, full_matrices
+from service.vectors import ARCSEC_PER_RADIAN, Vector, full_matrices, rotation_vectors
 
 LONGEST_GAP_S = 600.0
 """Longest gap in seconds within an interval; a propagated attitude is useless by then."""
@@ -54,13 +54,14 @@ class Cut:
     """Filter input of a window, divided into intervals in order of time, and the unused rest.
 
     `beyond_largest` counts gyro samples beyond the mission's largest rate, `not_given` samples of
-    zeros while the body turned, `alone` measurements that are too few to confirm an attitude at a
-    constant rate.
+    zeros while the body turned, `reversed` samples of a gyro that turns the other way than the
+    body, `alone` measurements that are too few to confirm an attitude at a constant rate.
     """
 
     stretches: list[Stretch]
     beyond_largest: int
     not_given: int
+    reversed: int
     alone: int
 
 
@@ -163,7 +164,7 @@ def cut(recorded: Recorded, mission: Mission) -> Cut:
     stretches: list[Stretch] = []
     attitude_ns, direction_ns = recorded.attitudes.tai_ns, recorded.directions.tai_ns
     left_a, left_d = np.ones(len(attitude_ns), bool), np.ones(len(direction_ns), bool)
-    beyond = not_given = 0
+    beyond = not_given = opposite = 0
     edges: list[int] = []
     if mission.gyro is not None and len(recorded.gyro_ns):
         kept = believed(mission.gyro, recorded.rates_rad_s)
@@ -171,6 +172,9 @@ def cut(recorded: Recorded, mission: Mission) -> Cut:
         none = zeros_while_turning(mission.gyro, recorded)
         not_given = int(np.count_nonzero(none))
         kept &= ~none
+        if turns_backwards(mission.gyro, recorded, kept):
+            opposite = int(np.count_nonzero(kept))
+            kept[:] = False
         times, rates = recorded.gyro_ns[kept], recorded.rates_rad_s[kept]
         for part in _unbroken(times):
             model, gyro = gyro_samples(mission.gyro, times[part], rates[part])
@@ -208,7 +212,9 @@ def cut(recorded: Recorded, mission: Mission) -> Cut:
         )
     # At least one measured attitude: the filter starts from nothing else.
     stretches = [each for each in stretches if len(each.attitudes.tai_ns)]
-    return Cut(sorted(stretches, key=lambda each: each.begin_ns), beyond, not_given, alone)
+    return Cut(
+        sorted(stretches, key=lambda each: each.begin_ns), beyond, not_given, opposite, alone
+    )
 
 
 def _unbroken(times_ns: Nanoseconds) -> Iterator[slice]:
@@ -270,6 +276,38 @@ def zeros_while_turning(settings: GyroSettings, recorded: Recorded) -> Mask:
     is_none = np.zeros(run[-1] + 1, bool)
     is_none[run[first[turned]]] = True
     return np.asarray(zero & is_none[run])
+
+
+LEAST_TURNS = 5
+"""Least number of steps between attitudes that show the sense of a gyro."""
+REVERSED_SHARE = 0.25
+"""Largest miss of a gyro with the other sign, as a share of the rotation that attitudes show."""
+
+
+def turns_backwards(settings: GyroSettings, recorded: Recorded, kept: Mask) -> bool:
+    """True if the kept gyro samples (mask (n,)) turn the other way than the body.
+
+    In most of the steps in which the body certainly rotated, the rotation by the gyro is then
+    opposite to that between the attitudes. A filter would take twice the rate for a bias.
+    """
+    a, times = recorded.attitudes, recorded.gyro_ns[kept]
+    if len(a.tai_ns) < 2 or not len(times):
+        return False
+    body = recorded.rates_rad_s[kept] @ settings.body_from_gyro.T
+    sums = np.vstack([np.zeros(3), np.cumsum(body, axis=0)])
+    first = np.searchsorted(times, a.tai_ns[:-1], side="right")
+    end = np.searchsorted(times, a.tai_ns[1:], side="right")
+    step_s = np.diff(a.tai_ns) * NS
+    mean = (sums[end] - sums[first]) / np.maximum(end - first, 1)[:, None]
+    by_gyro = mean * step_s[:, None]
+    turn = rotation_vectors(a.quaternion[:-1], a.quaternion[1:])
+    angle = np.linalg.norm(turn, axis=1)
+    shown = turns_beside_bias(settings, a.tai_ns, a.quaternion, a.covariance_rad2)
+    # A farther turn between two attitudes may be one in the opposite direction.
+    shown &= (end > first) & (np.linalg.norm(by_gyro, axis=1) < QUARTER_TURN_RAD)
+    opposite = np.linalg.norm(turn + by_gyro, axis=1) < REVERSED_SHARE * angle
+    count = np.count_nonzero(shown)
+    return bool(count >= LEAST_TURNS and np.count_nonzero(shown & opposite) > 0.5 * count)
 
 
 def constant_rate(settings: MotionSettings | None) -> ConstantRateModel:

@@ -18,10 +18,8 @@ from service.settings import Settings
 if TYPE_CHECKING:
     from service.acquire.picture import PictureResult
     from service.imaging.frames.frame import Frame
-    from service.vectors import Projection
 
 FEW_NAMES = 12
-WIDEST_PLAIN_DEG = 120
 LEAST_MEGAPIXELS = 64
 """Least limit in megapixels for pictures on this computer, higher than for uploads."""
 
@@ -128,7 +126,7 @@ def picture_reader(
 
 def focal_guess_px(parsed: Namespace, width_px: int, height_px: int) -> float | None:
     """Approximate focal length in pixels from the options; None without any."""
-    from service.identify.blind.solver import focal_px_of
+    from service.acquire.picture import focal_px_of_field
 
     if parsed.focal_px is not None:
         return float(parsed.focal_px)
@@ -138,11 +136,8 @@ def focal_guess_px(parsed: Namespace, width_px: int, height_px: int) -> float | 
     if parsed.focal_mm is not None:
         return 1000.0 * float(parsed.focal_mm) / float(parsed.pixel_um)
     if parsed.fov is not None:
-        projection: Projection = getattr(parsed, "lens", None) or "gnomonic"
-        if projection == "gnomonic" and parsed.fov >= WIDEST_PLAIN_DEG:
-            message = f"must be below {WIDEST_PLAIN_DEG} degrees, unless --lens names a fisheye"
-            raise BadInput(Fault("--fov", message, shown_value(parsed.fov)))
-        return focal_px_of(max(width_px, height_px), parsed.fov, projection)
+        side_px = max(width_px, height_px)
+        return focal_px_of_field(side_px, parsed.fov, getattr(parsed, "lens", None), "--fov")
     return None
 
 

@@ -49,10 +49,9 @@ class Pictures:
         """
         self._app.submissions.require_kernels()
         # Imported here, since the import takes a third of the service's starting time.
-        from service.acquire.picture import blind_sky, solve_picture
+        from service.acquire.picture import blind_sky, focal_px_of_field, solve_picture
         from service.acquire.picture_remarks import doubt_of_exposure
         from service.features.pictures.overlay import overlay_of
-        from service.identify.blind.solver import focal_px_of
 
         with file:
             shape, guess_px, zero_point_mag = None, None, None
@@ -69,7 +68,9 @@ class Pictures:
                 frame = read_frame(file, limits)
                 if field_of_view_deg is not None:
                     side_px = max(frame.width_px, frame.height_px)
-                    guess_px = focal_px_of(side_px, field_of_view_deg, projection or "gnomonic")
+                    guess_px = focal_px_of_field(
+                        side_px, field_of_view_deg, projection, "field_of_view_deg"
+                    )
                 sky, solver = blind_sky(self._app.sky.catalog)
                 result = solve_picture(frame, sky, solver, guess_px, projection=projection)
                 drawn = overlay_of(result, "") if draws else None

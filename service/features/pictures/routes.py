@@ -30,7 +30,11 @@ class PictureQuery(Query):
     ] = None
     field_of_view_deg: Annotated[
         float | None,
-        Field(gt=0, lt=180, description="Along the longer side; may be wrong by a quarter."),
+        Field(
+            gt=0,
+            le=180,
+            description="Along the longer side; may be wrong by a quarter. From 120: with `lens`.",
+        ),
     ] = None
     lens: Annotated[
         Projection | None,

@@ -23,6 +23,7 @@ def add(commands: Any) -> None:
         "Attitudes\noutside its segments are counted and left out.",
     )
     parser.add_argument("truth", type=Path, metavar="FILE", help="the true attitudes")
+    arguments.add_object(parser)
     parser.add_argument("--spacecraft", required=True, metavar="NAME", help=arguments.MISSION)
     arguments.add_period(parser, "the run that is read; default live")
     parser.add_argument(
@@ -48,7 +49,7 @@ def run(parsed: Namespace) -> int:
     from service.features.products.scoring import errors_of, statistics
 
     start, end = period_of(parsed)
-    truth = read_attitudes(parsed.truth, "FILE").of_basis(TRUE_BASES)
+    truth = read_attitudes(parsed.truth, "FILE", parsed.object).of_basis(TRUE_BASES)
     if not truth.segments:
         message = f"must be of attitudes with ATT_BASIS {', '.join(filter(None, TRUE_BASES))}"
         raise BadInput(Fault("FILE", message, shown_value(str(parsed.truth))))

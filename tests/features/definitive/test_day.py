@@ -96,7 +96,13 @@ def test_what_became_of_the_record_is_told(hours):
     _, day = hours
     assert day.measurements["started"] == 1
     assert day.measurements["accepted"] == 1350
-    assert day.gyro == {"samples": 10740, "gaps": 1, "beyond_largest": 0, "not_given": 0}
+    assert day.gyro == {
+        "samples": 10740,
+        "gaps": 1,
+        "beyond_largest": 0,
+        "not_given": 0,
+        "reversed": 0,
+    }
     assert 0.9 < day.nis_per_degree < 1.1
 
 
@@ -183,7 +189,13 @@ def test_axes_steps_and_the_moment_of_samples_are_the_mission_s(missions, rng):
     np.testing.assert_array_equal(one.quaternion, two.quaternion)
     assert len(one) == 1201
     # A median step of .25 s: nothing is a gap, though all is finer than a second.
-    assert same.gyro == {"samples": 4801, "gaps": 0, "beyond_largest": 0, "not_given": 0}
+    assert same.gyro == {
+        "samples": 4801,
+        "gaps": 0,
+        "beyond_largest": 0,
+        "not_given": 0,
+        "reversed": 0,
+    }
     # Of a steady turn the instant and the mean are the same; of its beginning they are not.
     instants = computed_day(
         recorded_of(gyro.tai_ns, gyro.rate_rad_s, attitudes),
@@ -202,7 +214,13 @@ def test_samples_beyond_the_largest_rate_are_left_out_and_counted(missions, rng)
     day = computed_day(
         recorded_of(gyro.tai_ns, rates, attitudes), mission_with(missions["XTE"], gyro=GYRO)
     )
-    assert day.gyro == {"samples": 601, "gaps": 1, "beyond_largest": 3, "not_given": 0}
+    assert day.gyro == {
+        "samples": 601,
+        "gaps": 1,
+        "beyond_largest": 3,
+        "not_given": 0,
+        "reversed": 0,
+    }
     errors = errors_of(day.stretches[0].samples["smoothed"], truth, NOON_NS)
     assert np.abs(errors).max() < 120.0 * ARCSEC
 
@@ -403,6 +421,26 @@ def test_zeros_of_a_gyro_take_nothing_from_the_rates_of_a_spinning_body(
         np.testing.assert_allclose(samples.rate_deg_per_s[5:-1], own[5:-1], atol=0.02)
         e = (Rotation.from_quat(samples.quaternion).inv() * truth.attitude[rows]).as_rotvec()
         assert np.mean(squares(e, covariances_of(samples))) / 3.0 < 2.0
+
+
+@pytest.mark.parametrize("rate_rad_s", [2e-3, -1e-3])
+def test_a_gyro_that_turns_the_other_way_is_not_used(missions, rng, rate_rad_s):
+    """The filter took twice the rate for a bias."""
+    truth = truth_of(lambda t: np.tile([0.0, rate_rad_s, 0.0], (len(t), 1)), 3600.0)
+    gyro, _ = gyro_of(truth, MODEL, rng)
+    attitudes = attitudes_of(truth, np.arange(0, 3601, 30), SIGMAS, rng)
+    mission = mission_with(missions["XTE"], gyro=GYRO)
+    right, wrong = (
+        computed_day(recorded_of(gyro.tai_ns, sign * gyro.rate_rad_s, attitudes), mission)
+        for sign in (1.0, -1.0)
+    )
+    assert (right.gyro["reversed"], wrong.gyro["reversed"]) == (0, len(gyro.tai_ns))
+    assert [each.model for each in right.stretches] == ["gyro"]
+    (stretch,) = wrong.stretches
+    assert stretch.model == "constant_rate"
+    samples = stretch.samples["smoothed"]
+    e = errors_of(samples, truth, NOON_NS)
+    assert np.mean(squares(e, covariances_of(samples))) / 3.0 < 2.0
 
 
 def test_zeros_of_a_gyro_stand_where_batches_carry_the_noise_of_a_body_at_rest(missions, rng):
