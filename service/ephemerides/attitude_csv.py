@@ -2,8 +2,10 @@
 
 A row has UTC and the quaternion q1, q2, q3, qc from inertial to body, scalar last.  Body rates in
 deg/s and the number of the unbroken interval are read from columns if present; rows with another
-status than good and other columns are skipped.  Without interval numbers a step of more than ten
-minutes ends an interval.
+status than good are skipped, and so are other columns, unless they say that the attitudes are not
+what is read: of another frame, another direction, rates in another unit.  Rows of several
+spacecraft or runs are refused.  Without interval numbers a step of more than ten minutes ends an
+interval.
 """
 
 import csv
@@ -28,6 +30,17 @@ from service.times import parse_utc
 
 _QUATERNION, _RATES = ("q1", "q2", "q3", "qc"), ("rate_x", "rate_y", "rate_z")
 _HEADER = re.compile(rb"\A[^\n]*\bq1\b[^\n]*,|\A[^\n]*,[^\n]*\bq1\b", re.IGNORECASE)
+_ONE_SERIES = ("spacecraft", "object", "object_name", "run", "grade")
+"""Columns with the same value in all rows, since a file has one series of attitudes."""
+_MEANINGS = {
+    "frame": ("EME2000", "J2000", "ICRF", "GCRF"),
+    "reference_frame": ("EME2000", "J2000", "ICRF", "GCRF"),
+    "ref_frame": ("EME2000", "J2000", "ICRF", "GCRF"),
+    "direction": ("INERTIAL_TO_BODY", "A2B"),
+    "time_system": ("UTC",),
+}
+"""Allowed values of columns that describe the attitudes."""
+_OTHER_RATES = re.compile(r"(body_|angular_)?(rate|omega|angvel|w)_?[xyz123]?(_|\b).*")
 _LONGEST_STEP_NS = 600 * 10**9
 _Row = tuple[int, str, list[float], list[float]]
 
@@ -76,6 +89,7 @@ def _rows(
 ) -> Iterator[tuple[int, str, int, list[float], list[float]]]:
     """Line, interval, time, quaternion and rates (NaN if missing) of each good row."""
     names: list[str] = []
+    series: dict[str, str] = {}
     for line, cells in _cells(source, file):
         if not names:
             names = [each.strip().lower() for each in cells]
@@ -84,6 +98,10 @@ def _rows(
                     message = "must be there once: times of UTC, and quaternions with qc the scalar"
                     raise source.bad(line, f"column {column}", message, ",".join(names))
             missing = [each for each in _RATES if each not in names]
+            for column in names:
+                if len(missing) == len(_RATES) and _OTHER_RATES.fullmatch(column):
+                    message = "is no column of rates: they are rate_x, rate_y, rate_z in deg/s"
+                    raise source.bad(line, f"column {column}", message)
             if 0 < len(missing) < len(_RATES):
                 raise source.bad(line, f"column {missing[0]}", "must be there beside other rates")
             continue
@@ -91,8 +109,13 @@ def _rows(
             message = f"must have {len(names)} cells, as the header has"
             raise source.bad(line, "row", message, ",".join(cells))
         row = dict(zip(names, (each.strip() for each in cells), strict=True))
-        if row.get("status", "good") != "good":
+        if (row.get("status") or "good").lower() != "good":
             continue
+        _require_meaning(source, line, row)
+        for column in _ONE_SERIES:
+            if column in row and series.setdefault(column, row[column]) != row[column]:
+                message = f"must be {series[column]}, as above: a file is of one series"
+                raise source.bad(line, f"column {column}", message, row[column])
         try:
             time_ns = parse_utc(row["time"]).tai_ns
         except BadInput as error:
@@ -104,6 +127,14 @@ def _rows(
             raise source.bad(line, "quaternion", message, numbers)
         rates = [_number(source, line, row, each) if row.get(each) else math.nan for each in _RATES]
         yield line, row.get("stretch", ""), time_ns, numbers, rates
+
+
+def _require_meaning(source: Source, line: int, row: dict[str, str]) -> None:
+    """Raise `BadFile` for a row of another frame, direction or time system."""
+    for column, allowed in _MEANINGS.items():
+        if (cell := row.get(column, "")) and cell.upper().replace(" ", "_") not in allowed:
+            message = f"must be {' or '.join(allowed)}"
+            raise source.bad(line, f"column {column}", message, cell)
 
 
 def _number(source: Source, line: int, row: dict[str, str], column: str) -> float:

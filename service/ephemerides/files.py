@@ -117,6 +117,11 @@ def _read_truth(file: str, opened: IO[bytes]) -> KnownAttitudes:
             read.append(decoder.decode(line))
         except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
             raise BadFile(Fault(place, f"is no truth: {error}")) from None
+    others = [line for line, each in enumerate(read, 1) if each.spacecraft != read[0].spacecraft]
+    if others:
+        message = f"must be {read[0].spacecraft}, as above: a file is of one spacecraft"
+        value = shown_value(read[others[0] - 1].spacecraft)
+        raise BadFile(Fault(f"{file}: line {others[0]}, spacecraft", message, value))
     time_ns = np.array([parse_utc(each.time, file).tai_ns for each in read], dtype=np.int64)
     if (np.diff(time_ns) <= 0).any():
         raise BadFile(Fault(file, "the times of its lines do not increase"))

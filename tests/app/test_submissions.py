@@ -222,13 +222,18 @@ def test_no_batch_of_simulated_telemetry_or_of_the_last_epoch_waits_for_a_file_o
     make, missions, monkeypatch, tmp_path
 ):
     """A server that starts without files of the sky builds these before it is ready."""
+
+    def run(build, missions, zones_built, whole_sky_built):
+        zones_built()
+        whole_sky_built()
+        build.is_needed = build.zones_needed = build.whole_sky_needed = False
+
     settings = Settings(database=f"sqlite:///{tmp_path}/served.db", replay_processes=0)
-    with closing(open_app(settings, serving=True)) as app:
+    with closing(open_app(settings)) as app:
         app.submissions.submit(make("recorded"))
+    monkeypatch.setattr(kernel_build, "_marker", lambda: Path("/none"))
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(
-        KernelBuild, "run", lambda build, missions, *built: built[0]() or built[1]()
-    )
+    monkeypatch.setattr(KernelBuild, "run", run)
     with closing(open_app(settings, serving=True)) as app:
         app.service.ready()
         waits_for = app.submissions.pool.builder
