@@ -47,6 +47,12 @@ MOST_DEGREE = 19
 DEFAULT_DEGREE = 7
 """Degree of Hermite interpolation if the file names none."""
 EARTH_GM_KM3_PER_S2 = 398600.4418
+LONGEST_ARC_RAD = 0.5
+"""Greatest arc in radians over which velocities are compared with the motion of positions."""
+VELOCITY_SHARE = 0.05
+"""Largest difference of velocities from the motion of positions, as a share of its speed."""
+ROUNDED_KM = 0.01
+"""Error of the difference of two positions in km."""
 LONGEST_STEP_OF_PERIOD = 1 / 12
 """Longest step between states, in orbital periods, for a file that names no interpolation."""
 SHORT_NS = 10**9
@@ -170,6 +176,7 @@ class _Reader(ccsds.MessageReader):
         points = self._points(form, count)
         if form.degree is None:
             self._check_steps(form)
+        self._check_velocities(form)
         return StateSegment(
             f"line {form.line}",
             np.array(form.times, dtype=np.int64),
@@ -191,6 +198,31 @@ class _Reader(ccsds.MessageReader):
                 "INTERPOLATION",
                 f"is missing, and {step_s[k]:.0f} s lie between two of its states, where at most "
                 f"{longest_s[k]:.0f} s give positions to about a kilometre",
+            )
+
+    def _check_velocities(self, form: _Form) -> None:
+        """Refuse velocities that are not the motion of the positions, such as zeros for none.
+
+        Velocities relative to the rotating Earth are refused too where they differ enough.
+        """
+        states = np.array(form.states)
+        step_s = np.diff(np.array(form.times)) * 1e-9
+        moved = np.diff(states[:, :3], axis=0) / step_s[:, None]
+        mean = 0.5 * (states[1:, 3:] + states[:-1, 3:])
+        speed = np.linalg.norm(moved, axis=1)
+        radius_km = np.linalg.norm(states[:, :3], axis=1)
+        # Over a longer arc the mean of both velocities is not that of the arc.
+        is_short = speed * step_s < LONGEST_ARC_RAD * np.minimum(radius_km[1:], radius_km[:-1])
+        missed = np.linalg.norm(moved - mean, axis=1)
+        # Positions may be rounded to metres.
+        least = VELOCITY_SHARE * speed + ROUNDED_KM / step_s
+        for k in np.flatnonzero(is_short & (missed > least))[:1]:
+            raise self._source.bad(
+                form.line,
+                "velocity",
+                f"of states {k + 1} and {k + 2} of the segment is not that of their positions, "
+                f"{speed[k]:.4g} km/s",
+                states[k, 3:].tolist(),
             )
 
     def _points(self, form: _Form, count: int) -> int:

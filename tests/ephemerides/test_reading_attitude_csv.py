@@ -70,6 +70,39 @@ def test_a_bad_row_is_refused_by_file_line_and_column(old, new, words, tmp_path)
 
 
 @pytest.mark.parametrize(
+    ("column", "cells", "words"),
+    [
+        ("spacecraft", "AB", "line 3: column spacecraft: must be A, as above"),
+        ("run", ("live", "r2"), "line 3: column run: must be live, as above"),
+        ("frame", ("ITRF",) * 2, "line 2: column frame: must be EME2000 or J2000"),
+        ("direction", ("body to inertial",) * 2, "line 2: column direction: must be INERTIAL_TO"),
+        ("time_system", ("GPS",) * 2, "line 2: column time_system: must be UTC"),
+    ],
+)
+def test_a_column_that_says_that_attitudes_are_others_is_read(column, cells, words, tmp_path):
+    """Rows of two spacecraft, or of an Earth-fixed frame, were one inertial series."""
+    head, *lines = SPUN.splitlines()
+    told = [f"{line},{cell}" for line, cell in zip(lines, cells, strict=True)]
+    with pytest.raises(BadFile, match=rf"a.csv, {words}"):
+        read("\n".join([f"{head},{column}", *told]), tmp_path)
+    same = [f"{line},{'EME2000' if column == 'frame' else ''}" for line in lines]
+    assert len(read("\n".join([f"{head},{column}", *same]), tmp_path)) == 2
+
+
+@pytest.mark.parametrize("name", ["rate_x_rad_per_s", "omega_x", "w_x", "body_rate_x_arcsec_s"])
+def test_rates_in_columns_of_other_names_are_refused(name, tmp_path):
+    x, y, z = (name.replace("x", axis, 1) for axis in "xyz")
+    with pytest.raises(BadFile, match=rf"a.csv, line 1: column {x}: is no column of rates"):
+        read(SPUN.replace("rate_x,rate_y,rate_z", f"{x},{y},{z}"), tmp_path)
+
+
+def test_a_truth_of_two_spacecraft_is_refused(tmp_path):
+    line = '{{"spacecraft": "{}", "time": "1996-01-10T12:00:0{}Z", "quaternion": [0, 0, 0, 1]}}'
+    with pytest.raises(BadFile, match=r"line 2, spacecraft: must be A, as above.*got 'B'"):
+        read(f"{line.format('A', 0)}\n{line.format('B', 1)}\n", tmp_path)
+
+
+@pytest.mark.parametrize(
     "data",
     [
         b"SIMPLE  =                    T / conforms to FITS standard".ljust(2880),

@@ -227,6 +227,19 @@ def test_a_bad_file_is_refused_with_file_line_and_field(text, words):
     assert words in str(refusal.value)
 
 
+@pytest.mark.parametrize("factor", [0.0, -1.0, 0.9])
+def test_velocities_that_are_not_those_of_the_positions_are_refused(factor):
+    """Zeros that stand for none, and velocities relative to the turning Earth, were taken."""
+    lines = []
+    for line in GOOD.splitlines():
+        words = line.split()
+        if len(words) == 7 and line[:4].isdigit():
+            words[4:] = (str(factor * float(each)) for each in words[4:])
+        lines.append(" ".join(words))
+    with pytest.raises(BadFile, match=r"velocity: of states 1 and 2 .* not that of their position"):
+        read("\n".join(lines))
+
+
 def test_bad_xml_is_refused_with_its_line():
     good = written_by_brahe("XML", np.arange(0.0, 51.0, 10.0))
     bad = [

@@ -6,9 +6,11 @@ import pytest
 
 from service.errors import BadInput
 from service.features.packets.definition import PacketDefinition
-from service.features.packets.reader import PacketReader
+from service.features.packets.reader import PacketReader, archive_of
 from service.observations.schema import submission_from_json
 from tests.features.packets.packing import TABLE, VECTORS, mission_with, xtce
+from tests.fresh_databases import sqlite_at
+from tests.web.serving import ended, serving_in_process
 
 FOLDER = Path(__file__).parent / "enumerated"
 XTCE = (FOLDER / "enum.xml").read_text()
@@ -48,6 +50,17 @@ def test_an_enumerated_flag_counts_by_its_number():
     assert len(batches) == 3
     assert totals.without_stars == 3
     assert totals.refused == 0
+
+
+def test_the_same_packets_over_http_give_the_same_attitudes(tmp_path):
+    content = b"".join(archive_of([FOLDER / "enum.xml", FOLDER / "a.dat"]))
+    headers = {"Content-Type": "application/x-tar"}
+    database = sqlite_at(tmp_path / "packets.db")
+    with serving_in_process(database, mission_with(TABLE_OF_FLAG)) as served:
+        begun = served.client.post("/api/v1/replays?run=flags", content=content, headers=headers)
+        state = ended(served.client, begun)
+    assert (state["state"], state["counts"]["new"]) == ("done", 3)
+    assert (state["packets"]["packets"], state["packets"]["refused"]) == (6, 0)
 
 
 def test_valid_labels_say_which_labels_hold_an_attitude():
