@@ -74,7 +74,7 @@ def _not_telemetry(start: bytes, form: str) -> str | None:
 
 @contextmanager
 def _opened(source: Path | BinaryIO, form: str) -> Iterator[BinaryIO]:
-    """Context manager of a file as UTF-8 with line feeds; other encodings are converted first."""
+    """Context manager of a telemetry file; seekable UTF-16 text, or CSV with CRs, is converted."""
     if not isinstance(source, Path):
         yield source
         return

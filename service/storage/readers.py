@@ -47,12 +47,12 @@ class Readers:
         )
 
     def reading(self) -> AbstractContextManager[Connection]:
-        """Provide a read-only connection with one snapshot of the database."""
+        """Context manager of a read-only connection with one snapshot of the database."""
         return self.reading_record()
 
     @contextmanager
     def reading_record(self) -> Iterator[Connection]:
-        """Provide a connection for reading recorded data, which need not wait for projections.
+        """Context manager of a read-only connection that does not wait for projections.
 
         Raises `Busy` where the database cannot be reached or every connection is in use.
         """
@@ -63,7 +63,7 @@ class Readers:
 
     @contextmanager
     def lookup(self) -> Iterator[Connection]:
-        """Provide a connection for prepared look-ups, each of which may see another snapshot.
+        """Context manager of a connection for look-ups, each of which may see another snapshot.
 
         Look-ups take turns.
         """

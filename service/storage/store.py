@@ -106,7 +106,7 @@ class Store(Readers):
 
     @contextmanager
     def reading_batch(self, id: str) -> Iterator[tuple[Connection, bool]]:
-        """Provide a connection that holds the batch of a result, and True if that is archived.
+        """Context manager of a connection with a result's batch, and True if that is archived.
 
         For an unknown result the connection is the database's.
         """

@@ -175,7 +175,7 @@ class AsyncItems(Generic[Row]):
             query["cursor"] = page.next_cursor
 
     async def all(self) -> list[Row]:
-        """Read all items of the list."""
+        """Read all items of the paged list at once."""
         return [item async for item in self]
 
     async def to_arrow(self) -> "pa.Table":

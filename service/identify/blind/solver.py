@@ -62,7 +62,7 @@ class FocalRange:
 
     @classmethod
     def about(cls, focal_px: float, share: float) -> "FocalRange":
-        """The range of focal lengths within a relative error of one."""
+        """The range of focal lengths within a relative error `share` of a given one."""
         return cls(focal_px / (1.0 + share), focal_px * (1.0 + share))
 
     @classmethod
@@ -111,7 +111,7 @@ class BlindSolver:
 
     @property
     def nbytes(self) -> int:
-        """Estimated size in bytes once all pattern levels are built."""
+        """Estimated size in bytes of the blind solver once all pattern levels are built."""
         return 10 * self.direction.nbytes + 90_000_000
 
     def level(self, radius_deg: float) -> QuadLevel:

@@ -95,7 +95,7 @@ def _stars(star, nodes):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def _group_of(v, near, least, star, start, neighbour, group, work):  # type: ignore[no-untyped-def]
-    """A match group of at least `least` nodes with `v`, from the nodes `near`; size 0 if none.
+    """Find a match group of at least `least` nodes with node `v` among `near`; size 0 if none.
 
     Depth first, with one level per node of the group; held[at[d]:end[d]] are the nodes of level d
     that are consistent with all levels above and still to be tried. Returns the size and the

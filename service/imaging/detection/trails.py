@@ -307,7 +307,7 @@ def _changed(trails: Trails, name: str, change: float) -> Trails:
 
 
 def _difference(one: Trails, other: Trails) -> float:
-    """The largest difference of two motions in pixels, with rotation measured at the edge."""
+    """The largest difference in pixels of two trails' motions or widths, rotation at the edge."""
     a, b = one.motion, other.motion
     return max(
         abs(a.shift_u_px - b.shift_u_px),

@@ -238,7 +238,7 @@ def write_settings(folder: Path, settings: Settings) -> None:
 
 
 def read_settings(folder: Path, digest: str) -> Settings:
-    """Read the settings or the catalog with a digest."""
+    """Read the settings or the catalog with a digest from an archive."""
     return _decoded(settings_file(folder, digest), Settings)
 
 

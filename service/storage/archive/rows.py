@@ -276,7 +276,7 @@ class Opened:
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
-        """Provide the connection to the database in memory."""
+        """Context manager of the connection to the database in memory."""
         with self._lock, self._engine.connect() as connection:
             yield connection
 

@@ -122,7 +122,7 @@ class PersistentConnection:
 
     @contextmanager
     def lookup(self) -> Iterator[Connection]:
-        """Provide a connection for look-ups; on SQLite each prepared query has its own snapshot."""
+        """Context manager of a connection for look-ups; on SQLite each sees its own snapshot."""
         with self._exclusive() as connection:
             if self._is_shared:
                 connection.begin()

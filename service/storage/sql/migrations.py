@@ -202,7 +202,7 @@ def reported(url: URL) -> Iterator[None]:
 
 @contextmanager
 def disposed(engine: Engine) -> Iterator[Engine]:
-    """Provide an engine whose connections are closed at the end."""
+    """Context manager of an engine, whose connections are closed at the end."""
     try:
         yield engine
     finally:

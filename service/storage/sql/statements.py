@@ -144,7 +144,7 @@ def count(connection: sa.Connection, table: sa.Table, *chosen: sa.ColumnElement[
 
 
 def rows_of(connection: sa.Connection, query: sa.Select[Any]) -> list[Row]:
-    """Run a query; its rows as values by column name."""
+    """Run a query; returns its rows as values by column name."""
     return [dict(row) for row in connection.execute(query).mappings()]
 
 

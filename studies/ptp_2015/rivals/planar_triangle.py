@@ -227,7 +227,7 @@ def _pivot(  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def _sharing_two(star, kept, count, others, found):  # type: ignore[no-untyped-def]
-    """Keep the candidates that share two stars with a candidate of another triangle."""
+    """Keep candidates that share two stars with one of another triangle; returns their number."""
     edge = np.empty(3 * found, np.int64)
     for at in range(found):
         a, b, c = star[others[at]]
