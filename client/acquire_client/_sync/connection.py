@@ -172,7 +172,7 @@ class Items(Generic[Row]):
             query["cursor"] = page.next_cursor
 
     def all(self) -> list[Row]:
-        """Read all items of the list."""
+        """Read all items of the paged list at once."""
         return list(self)
 
     def to_arrow(self) -> "pa.Table":
