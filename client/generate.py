@@ -1,7 +1,9 @@
 """Writes what of the client is generated: python client/generate.py, or --check for differences.
 
-The models come from the records of the service that the client's methods and events name, with
-all that these hold; the synchronous half comes from the asynchronous one, as httpcore does it.
+The methods of one request each come from the routes that have a `ClientMethod`, as the OpenAPI
+document describes them.  The models come from the records of the service that the client's methods
+and events name, with all that these hold; the synchronous half comes from the asynchronous one, as
+httpcore does it.
 """
 
 import argparse
@@ -15,16 +17,19 @@ from importlib.util import find_spec
 from pathlib import Path
 from pkgutil import iter_modules
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
 
 from msgspec import NODEFAULT, UNSET, UnsetType, structs
 from pydantic.fields import FieldInfo
 
 from service import contract
 from service.contract import answers, base
-from service.contract.base import Absent, DescribedAs, Record, text_below
+from service.contract.base import Absent, DescribedAs, Record, component_name, text_below
 from service.contract.events import EVENT_DATA
 from service.feature import known_features
+from service.web.app import bare_app
+from service.web.openapi import CLIENT_METHODS, ClientMethod
+from service.web.requests.query_parameters import TIME_SCHEMA
 
 CLIENT = Path(__file__).parent / "acquire_client"
 HEADER = "# Written by `make client` from {}.\n"
@@ -106,10 +111,13 @@ def with_parts(record: type[Record], known: dict[type[Record], None]) -> None:
     known[record] = None
 
 
-def models() -> Mapping[str, str]:
-    """Generate the text of each module of models, by its path in the client."""
+def models(methods: str) -> Mapping[str, str]:
+    """Generate the text of each module of models, by its path in the client.
+
+    `methods` is the text of all generated methods.
+    """
     own = {*CLIENT.glob("*.py"), *CLIENT.glob("_async/*.py")} - {CLIENT / "events.py"}
-    texts = "\n".join(path.read_text(encoding="utf-8") for path in own)
+    texts = "\n".join((methods, *(path.read_text(encoding="utf-8") for path in own)))
     names = set(re.findall(r"\bmodels\.([A-Z]\w+)", texts)) | NAMED_BESIDE
     known = all_records()
     needed: dict[type[Record], None] = {}
@@ -280,6 +288,228 @@ def events_text() -> str:
     )
 
 
+# ---- methods ---------------------------------------------------------------------------------
+
+JSON = "application/json"
+PLAIN_TYPES = {
+    "string": "str",
+    "integer": "int",
+    "number": "float",
+    "boolean": "bool",
+    "null": "None",
+    "object": "Mapping[str, Any]",
+}
+
+
+class Argument(NamedTuple):
+    """Argument of a method: a name in the path, or a field of the query or the body."""
+
+    name: str
+    field: str
+    place: str
+    kind: str
+    default: str
+    """Text of its default; empty for a required argument."""
+    about: str
+
+
+def argument_type(schema: Mapping[str, Any]) -> str:
+    """Type of an argument as text, from the schema of its field."""
+    if "anyOf" in schema:
+        return " | ".join(dict.fromkeys(map(argument_type, schema["anyOf"])))
+    if schema.get("pattern") == TIME_SCHEMA["pattern"]:
+        return "Time"
+    if schema.get("type") == "array":
+        return f"Sequence[{argument_type(schema['items'])}]"
+    for word, alias in WORDS.items():
+        known, allowed = get_args(described_type(alias)), schema.get("enum", ())
+        if set(known) <= set(allowed):
+            others = [each for each in allowed if each not in known]
+            return f"{word} | Literal{others}" if others else word
+    return PLAIN_TYPES[schema.get("type", "object")]
+
+
+def argument(
+    method: ClientMethod, path: str, place: str, field: str, required: bool, field_schema: Any
+) -> Argument:
+    """Argument for a field, by its description in the OpenAPI document."""
+    name = method.renamed.get(field, field)
+    if place == "path" and f"/spacecraft/{{{field}}}/" in path:
+        name = "spacecraft"
+    described = field_schema.get("schema", field_schema)
+    default = method.defaults.get(field, described.get("default"))
+    kind = argument_type(described)
+    text = (
+        ""
+        if required and field not in method.defaults
+        else repr(tuple(default) if isinstance(default, list) else default)
+    )
+    if text == "None" and not kind.endswith("None"):
+        kind += " | None"
+    return Argument(name, field, place, kind, text, field_schema.get("description", ""))
+
+
+def arguments(
+    method: ClientMethod, path: str, operation: Mapping[str, Any], schemas: Mapping[str, Any]
+) -> list[Argument]:
+    """Arguments of a method in their order: of the path, by place, by keyword."""
+    found = [
+        argument(method, path, each["in"], each["name"], each["required"], each)
+        for each in operation.get("parameters", ())
+        if each["in"] != "header"
+    ]
+    content = operation.get("requestBody", {}).get("content", {})
+    if method.body:
+        kind = "Batch" if JSON in content else "bytes"
+        about = "The body of the request." if JSON in content else "The content of the file."
+        found.append(Argument(method.body, "", "body", kind, "", about))
+    elif content:
+        body = schemas[content[JSON]["schema"]["$ref"].rpartition("/")[2]]
+        found += [
+            argument(method, path, "body", name, name in body.get("required", ()), schema)
+            for name, schema in body["properties"].items()
+        ]
+    omitted = {*method.omitted, "format"}
+    if any(each.field == "cursor" for each in found):
+        omitted |= {"limit", "cursor"}
+    by_place = ["", *method.by_place]
+
+    def order(each: Argument) -> int:
+        if each.place == "path":
+            return -1
+        return by_place.index(each.field) if each.field in by_place else len(by_place)
+
+    return sorted((each for each in found if each.field not in omitted), key=order)
+
+
+def answer_record(operation: Mapping[str, Any], known: Mapping[str, type[Record]]) -> type[Record]:
+    """Record of the successful answer of an operation."""
+    (name,) = {
+        response["content"][JSON]["schema"]["$ref"].rpartition("/")[2]
+        for status, response in operation["responses"].items()
+        if status.startswith("2")
+    }
+    return known[name]
+
+
+def method_text(
+    method: ClientMethod,
+    path: str,
+    verb: str,
+    operation: Mapping[str, Any],
+    schemas: Mapping[str, Any],
+    known: Mapping[str, type[Record]],
+) -> str:
+    """Generate the text of a method."""
+    given = arguments(method, path, operation, schemas)
+    named = [each for each in given if each.place != "path" and each.field]
+    by_keyword = [each for each in named if each.field not in method.by_place]
+    signature = ["self", *(argument_text(each) for each in given if each not in by_keyword)]
+    if by_keyword:
+        signature += ["*", *map(argument_text, by_keyword)]
+    names_in_path = {each.field: each.name for each in given if each.place == "path"}
+    parts = [
+        names_in_path[part[1:-1]] if part.startswith("{") else repr(part)
+        for part in path.removeprefix("/api/v1/").split("/")
+    ]
+    lines, sent = [f"path = path_of({', '.join(parts)})"], [f'"{verb.upper()}"', "path"]
+    for place in ("query", "body"):
+        fields = [f'"{each.field}": {each.name}' for each in named if each.place == place]
+        fields += [f'"format": "{method.format}"'] if method.format and place == "query" else []
+        if fields:
+            lines.append(f"{place} = {{{', '.join(fields)}}}")
+            sent.append(f"{place}={place if place == 'query' else 'parameters_of(body)'}")
+    if method.body:
+        is_json = JSON in operation["requestBody"]["content"]
+        sent.append(f"body={method.body}" if is_json else f"content={method.body}, headers=BINARY")
+    if method.repeatable:
+        sent.append("repeat=Repeat.ALWAYS")
+    decorator, returned, call = "single_request", "str", f"Call(text, {', '.join(sent)})"
+    if not method.format:
+        record = answer_record(operation, known)
+        held = struct_fields(record).keys()
+        item = f"models.{client_name(record)}"
+        if held <= {"items", "next_cursor"}:
+            (listed,) = get_args(get_type_hints(record)["items"])
+            item = f"models.{client_name(listed)}"
+        returned, call = item, f"Call(model({item}), {', '.join(sent)})"
+        if held == {"items"}:
+            returned, call = f"list[{item}]", f"Call(items({item}), {', '.join(sent)})"
+        elif held == {"items", "next_cursor"}:
+            decorator, call = "paged_list", f"Listing({item}, path, query)"
+    kind = "Listing" if decorator == "paged_list" else "Call"
+    head = f"def {method.name}({', '.join(signature)}) -> {kind}[{returned}]:"
+    body = [docstring_of(method, operation, given), *lines, f"return {call}"]
+    return f"\n    @{decorator}\n    {head}\n" + textwrap.indent("\n".join(body), " " * 8) + "\n"
+
+
+def argument_text(each: Argument) -> str:
+    """Generate an argument with its type and default."""
+    return f"{each.name}: {each.kind}" + (f" = {each.default}" if each.default else "")
+
+
+def docstring_of(
+    method: ClientMethod, operation: Mapping[str, Any], given: Sequence[Argument]
+) -> str:
+    """Generate a method's docstring: what its route does, its arguments, and the example."""
+    first, *others = f"{operation['summary']}.".split("\n\n")
+    texts = [first, *("\n".join(textwrap.wrap(each, 90)) for each in others)]
+    described = [f"- `{each.name}`: {in_client_words(each.about)}" for each in given if each.about]
+    texts.append(
+        "\n".join("\n".join(textwrap.wrap(e, 90, subsequent_indent="  ")) for e in described)
+    )
+    texts.append(textwrap.dedent(method.example).strip())
+    return '"""' + "\n\n".join(filter(None, texts)) + '\n"""'
+
+
+def methods() -> Mapping[str, str]:
+    """Generate the text of each module of methods, by its path in the client."""
+    described = bare_app().openapi()
+    schemas = described["components"]["schemas"]
+    known = {component_name(each): each for each in all_records().values()}
+    found: dict[str, list[str]] = {}
+    for path, operations in described["paths"].items():
+        for verb, operation in operations.items():
+            for handler, method in reversed(CLIENT_METHODS.get(operation["operationId"], [])):
+                text = method_text(method, path, verb, operation, schemas, known)
+                found.setdefault(handler.__module__, []).append(text)
+    modules = {each.removesuffix(".routes").rpartition(".")[2]: each for each in found}
+    texts = {
+        f"methods/{name}.py": methods_module(name, source, found[source])
+        for name, source in modules.items()
+    }
+    classes = {name: class_of_methods(name) for name in sorted(modules)}
+    imports = "".join(f"from .{name} import {each}\n" for name, each in classes.items())
+    return texts | {
+        "methods/__init__.py": '"""Client methods that send one request each."""\n'
+        f"{HEADER.format('the routes of the service')}\n{imports}\n\n"
+        f"class Methods({', '.join(classes.values())}):\n"
+        '    """All methods that send one request each.\n\n'
+        "    `who` signs a change while access is open; with a token, its name does.\n"
+        '    """\n'
+    }
+
+
+def class_of_methods(name: str) -> str:
+    """Name of the class with the methods of a module."""
+    return f"{name.title().replace('_', '')}Methods"
+
+
+def methods_module(name: str, source: str, texts: Sequence[str]) -> str:
+    """Generate the text of a module of methods; ruff removes unused imports."""
+    return (
+        f'"""Client methods: {name.replace("_", " ")}."""\n'
+        f"{HEADER.format(source.replace('.', '/') + '.py')}\n"
+        "from collections.abc import Mapping, Sequence\nfrom typing import Any, Literal\n\n"
+        "from .. import models\n"
+        "from ..calls import Call, Listing, items, model, paged_list, single_request, text\n"
+        "from ..encoding import BINARY, Batch, Time, parameters_of, path_of\n"
+        f"from ..retrying import Repeat\nfrom ..words import {', '.join(WORDS)}\n\n\n"
+        f'class {class_of_methods(name)}:\n    """Methods for the routes of '
+        f'`{source.replace(".", "/")}.py` of the service."""\n' + "".join(texts)
+    )
+
+
 # ---- the synchronous half --------------------------------------------------------------------
 
 BY_HAND = ("__init__.py", "backend.py")
@@ -330,9 +560,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--check", action="store_true", help="write nothing, name what differs")
     only_checks = parser.parse_args().check
-    made = {CLIENT / path: text for path, text in {**models(), **synchronous()}.items()}
+    of_routes = methods()
+    of_records = models("\n".join(of_routes.values()))
+    generated = {**of_routes, **of_records, **synchronous()}
+    made = {CLIENT / path: text for path, text in generated.items()}
     texts = {path: tidied(text, path) for path, text in made.items()}
-    folders = [CLIENT / "models", CLIENT / "_sync"]
+    folders = [CLIENT / "methods", CLIENT / "models", CLIENT / "_sync"]
     found = {path for folder in folders for path in folder.glob("*.py")}
     left = {path for path in found - texts.keys() if path.name not in BY_HAND}
     stale = [p for p, text in texts.items() if not p.exists() or p.read_text("utf-8") != text]
@@ -341,6 +574,7 @@ def main() -> int:
             print(f"{path.relative_to(CLIENT.parent)} differs from its source; run: make client")
         return 1 if stale or left else 0
     for path in stale:
+        path.parent.mkdir(exist_ok=True)
         path.write_text(texts[path], encoding="utf-8")
     for path in left:
         path.unlink()

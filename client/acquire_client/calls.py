@@ -49,21 +49,21 @@ class Listing(Generic[Row]):
     query: Query
 
 
-def get(kind: type[T], path: str, query: Query | None = None) -> Call[T]:
-    """Describe a GET request whose answer is a model."""
-    return Call(partial(decoded, kind=kind), "GET", path, query)
+def model(kind: type[T]) -> Callable[[httpx.Response], T]:
+    """Reader of an answer that is a model."""
+    return partial(decoded, kind=kind)
 
 
-def get_items(kind: type[Row], path: str, query: Query | None = None) -> Call[list[Row]]:
-    """Describe a GET request whose answer is a short list of models."""
+def items(kind: type[Row]) -> Callable[[httpx.Response], list[Row]]:
+    """Reader of an answer that is a short list of models."""
     # The type is known only at run time, which type checkers do not allow.
     page: Any = Page[kind]  # type: ignore[valid-type]
-    return Call(lambda response: decoded(response, page).items, "GET", path, query)
+    return lambda response: decoded(response, page).items
 
 
-def post(kind: type[T], path: str, body: Any, repeat: Repeat = Repeat.IF_REFUSED) -> Call[T]:
-    """Describe a POST request with JSON whose answer is a model."""
-    return Call(partial(decoded, kind=kind), "POST", path, body=body, repeat=repeat)
+def text(response: httpx.Response) -> str:
+    """Read an answer that is a text."""
+    return response.text
 
 
 class _Method:

@@ -1,7 +1,7 @@
 """Encoding of the client's requests: addresses, queries and bodies."""
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
@@ -18,9 +18,10 @@ Batch: TypeAlias = Mapping[str, Any] | str | bytes
 Time: TypeAlias = str | datetime
 """UTC as text, such as `1996-01-10T12:00:00Z` or `1996-010T12:00:00Z`, or with a time zone."""
 
-Query: TypeAlias = Mapping[str, str | int | float | bool | list[str] | datetime | None]
+Query: TypeAlias = Mapping[str, str | int | float | bool | Sequence[str] | datetime | None]
 
 PIECE_BYTES = 1 << 16
+BINARY = {"Content-Type": "application/octet-stream"}
 
 T = TypeVar("T")
 
@@ -57,12 +58,14 @@ def path_of(*parts: str) -> str:
     return "/api/v1/" + "/".join(quote(each, safe="") for each in parts)
 
 
-def parameters_of(query: Query) -> dict[str, Any]:
-    """Query parameters of a request; those that are None are left out."""
+def parameters_of(query: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields of a query or a body; those that are None are left out."""
     return {name: _parameter(name, value) for name, value in query.items() if value is not None}
 
 
 def _parameter(name: str, value: object) -> object:
+    if isinstance(value, Iterable) and not isinstance(value, str | Mapping):
+        return list(value)
     return _utc(name, value) if isinstance(value, datetime) else value
 
 

@@ -116,6 +116,38 @@ class Returns:
     status: int = 200
 
 
+@dataclass(frozen=True)
+class ClientMethod:
+    """Method of the Python client for a route, which `make client` writes from its description.
+
+    Arguments are the names in the path, then the fields of query and body: those `by_place` in
+    this order, the others by keyword, `omitted` ones not at all.  `renamed` maps fields to other
+    names of arguments.  A `body` names one argument for a body that is sent unchanged.  A field
+    `format` is no argument: a method with a `format` asks for it, and returns its text.
+    `repeatable` marks a POST request that changes nothing when it is sent again.  `example` is a
+    doctest of the synchronous client, after the batch of the documents was submitted.
+    """
+
+    name: str
+    by_place: tuple[str, ...] = ()
+    renamed: Mapping[str, str] = field(default_factory=dict)
+    omitted: tuple[str, ...] = ()
+    defaults: Mapping[str, Any] = field(default_factory=dict)
+    body: str = ""
+    format: str = ""
+    repeatable: bool = False
+    example: str = ""
+
+    def __call__(self, handler: Handler) -> Handler:
+        """Give the route of the decorated handler this method of the client."""
+        CLIENT_METHODS.setdefault(handler.__name__, []).append((handler, self))
+        return handler
+
+
+CLIENT_METHODS: dict[str, list[tuple[Callable[..., Any], ClientMethod]]] = {}
+"""Methods of the Python client for each route, with its handler, by the name of the handler."""
+
+
 class ApiRouter(APIRouter):
     """Router for the API routes of one subject, with their descriptions."""
 

@@ -11,6 +11,7 @@ from contextlib import aclosing, contextmanager
 from datetime import UTC, datetime, timedelta, timezone
 from email.utils import format_datetime
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pkgutil import iter_modules
 from unittest.mock import create_autospec
 
 import httpx
@@ -32,8 +33,8 @@ from acquire_client import (
     Unauthenticated,
     UnexpectedAnswer,
     errors,
+    methods,
     operations,
-    spacecraft,
 )
 from acquire_client._sync import client as whole
 from acquire_client._sync import connection
@@ -68,7 +69,8 @@ def test_the_examples_of_the_methods_give_what_they_show(client, example, tmp_pa
     (tmp_path / "pass.ndjson").write_text(json.dumps(example) + '\n{"cut": \n', "utf-8")
     monkeypatch.chdir(tmp_path)
     tried = 0
-    for module in (whole, spacecraft, operations):
+    of_routes = [getattr(methods, each.name) for each in iter_modules(methods.__path__)]
+    for module in (whole, operations, *of_routes):
         found = doctest.testmod(
             module, extraglobs={"client": client, "batch": example, "block": GYRO}
         )
@@ -185,6 +187,15 @@ def test_a_class_below_a_client_keeps_its_own_methods():
         pass
 
     assert Below("http://127.0.0.1:9").latest("XTE") == "own"
+
+
+def test_batches_without_an_attitude_are_asked_for_by_the_word_of_the_api(client, drawn):
+    whole, cut = drawn(2)
+    cut["observations"] = [cut["observations"][0] | {"stars": cut["observations"][0]["stars"][:1]}]
+    for each in (whole, cut):
+        client.submit(each)
+    (found,) = client.batches("XTE", run=whole["run"], status="none")
+    assert found.batch == cut["batch"]
 
 
 def test_pages_are_read_as_they_are_needed(client, drawn, monkeypatch):

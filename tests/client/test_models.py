@@ -1,4 +1,4 @@
-"""The models are those of openapi.yaml: every field, its type, and whether it may be absent."""
+"""Models and methods are those of openapi.yaml: fields, types, and whether one may be absent."""
 
 import ast
 import inspect
@@ -15,6 +15,7 @@ from acquire_client import event_lines, models, words
 from msgspec import UNSET, UnsetType
 
 from service.contract.base import Absent, Components, Count, Moment, Record, component_name, doc
+from service.web.openapi import ClientMethod
 from tests.web.conformance import FILE, reference
 
 SCHEMAS = reference()["components"]["schemas"]
@@ -160,4 +161,48 @@ def test_a_record_of_any_package_becomes_a_model():
     """Whatever is not known."""
     note: str | None = None
     count: int = 0'''
+    )
+
+
+def test_a_route_of_any_package_becomes_a_method():
+    """From its description alone: names, types, defaults and texts."""
+    run = {"name": "run", "in": "query", "required": False, "description": "null: every run."}
+    operation = {
+        "summary": "Dwells of an axis.\n\nThe longest first",
+        "parameters": [
+            {"name": "name", "in": "path", "required": True, "schema": {"type": "string"}},
+            run | {"schema": {"anyOf": [{"type": "string"}, {"type": "null"}]}},
+            {
+                "name": "axes",
+                "in": "query",
+                "required": True,
+                "schema": {"type": "array", "items": {"type": "integer"}},
+            },
+        ],
+        "responses": {
+            "200": {"content": {generate.JSON: {"schema": {"$ref": "#/components/schemas/Dwell"}}}}
+        },
+    }
+    method = ClientMethod("dwells", by_place=("axes",), example=">>> 1 + 1\n2")
+    path = "/api/v1/spacecraft/{name}/dwells"
+    text = generate.method_text(method, path, "get", operation, {}, {"Dwell": Dwell})
+    assert (
+        generate.tidied(text.replace("\n    ", "\n").strip(), Path("dwells.py"))
+        == '''@single_request
+def dwells(
+    self, spacecraft: str, axes: Sequence[int], *, run: str | None = None
+) -> Call[models.AxisDwell]:
+    """Dwells of an axis.
+
+    The longest first.
+
+    - `run`: None: every run.
+
+    >>> 1 + 1
+    2
+    """
+    path = path_of("spacecraft", spacecraft, "dwells")
+    query = {"axes": axes, "run": run}
+    return Call(model(models.AxisDwell), "GET", path, query=query)
+'''
     )

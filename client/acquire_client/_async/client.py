@@ -12,9 +12,9 @@ from .. import models
 from ..encoding import Batch, Query, decoded, path_of, pieces_of
 from ..errors import Busy, EventsLost, Problem, ReplayEnded
 from ..event_lines import Block, BlockReader, Event
-from ..operations import Access, Alarms, BatchOutcome, Calibrations, Results, Runs
+from ..methods import Methods
+from ..operations import BatchOutcome, Results
 from ..retrying import Patience, Repeat
-from ..spacecraft import Gyro, Spacecraft
 from .backend import Source, bounded_map, iterated, sleep
 from .connection import AsyncConnection
 
@@ -220,7 +220,7 @@ class AsyncEvents:
         return event
 
 
-class AsyncClient(AsyncBatches, AsyncReplays, Runs, Access, Alarms, Calibrations, Spacecraft, Gyro):
+class AsyncClient(AsyncBatches, AsyncReplays, Methods):
     """Client of the service at an address; a context manager that closes its connections.
 
     `token` is sent with each request.  A request that may be repeated is sent again after a lost

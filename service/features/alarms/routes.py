@@ -16,7 +16,7 @@ from service.features.alarms.state import StateFilter
 from service.observations.schema import Key, Wire
 from service.trends.limits import LimitSettings
 from service.trends.quantities import QuantityName, limited_names
-from service.web.openapi import LINK, ApiRouter, Returns
+from service.web.openapi import LINK, ApiRouter, ClientMethod, Returns
 from service.web.requests import query_parameters as params
 from service.web.requests.access import (
     AppDep,
@@ -211,6 +211,14 @@ def _set(
     )
 
 
+@ClientMethod(
+    "alarms",
+    by_place=("spacecraft",),
+    example="""
+    >>> [alarm.severity for alarm in client.alarms("XTE")]
+    []
+    """,
+)
 @router.serves(
     "GET /alarms", Policy("read", "query"), Returns("A page of alarms.", records.AlarmPage, LINK)
 )
@@ -219,6 +227,7 @@ def list_alarms(request: Request, query: FromQuery[AlarmQuery], app: AppDep) -> 
     return page_response(request, app.part(Alarms).page(**query.asked()))
 
 
+@ClientMethod("alarm")
 @router.serves(
     "GET /alarms/{id}", Policy("read", "nothing"), Returns("The alarm.", records.AlarmWithActions)
 )
@@ -227,6 +236,7 @@ def get_alarm(id: AlarmId, app: AppDep, caller: CallerDep) -> Response:
     return json_response(_visible_alarm(app, id, caller))
 
 
+@ClientMethod("acknowledge")
 @router.serves(
     "POST /alarms/{id}/acknowledge",
     Policy("operate", "nothing"),
@@ -242,6 +252,7 @@ def acknowledge_alarm(id: AlarmId, body: JsonBody, app: AppDep, change: ChangeDe
     return json_response(app.part(Alarms).acknowledge(id, who, asked.comment, change.entry()))
 
 
+@ClientMethod("shelve", by_place=("minutes",))
 @router.serves(
     "POST /alarms/{id}/shelve",
     Policy("operate", "nothing"),
@@ -259,6 +270,7 @@ def shelve_alarm(id: AlarmId, body: JsonBody, app: AppDep, change: ChangeDep) ->
     )
 
 
+@ClientMethod("unshelve")
 @router.serves(
     "POST /alarms/{id}/unshelve",
     Policy("operate", "nothing"),
@@ -274,6 +286,7 @@ def unshelve_alarm(id: AlarmId, body: JsonBody, app: AppDep, change: ChangeDep) 
     return json_response(app.part(Alarms).unshelve(id, who, asked.comment, change.entry()))
 
 
+@ClientMethod("comment", by_place=("comment",))
 @router.serves(
     "POST /alarms/{id}/comment",
     Policy("operate", "nothing"),

@@ -18,7 +18,7 @@ from service.features.calibration.linearise import LARGEST_DEGREE
 from service.features.calibration.part import Calibrations
 from service.observations.schema import LIVE, Key, RunName, Wire
 from service.web.api.batches import COMPARISON_S, SampleSize
-from service.web.openapi import LINK, LOCATION, ApiRouter, Returns
+from service.web.openapi import LINK, LOCATION, ApiRouter, ClientMethod, Returns
 from service.web.requests import query_parameters as params
 from service.web.requests.access import (
     AppDep,
@@ -127,6 +127,14 @@ class CalibrationQuery(Query):
     cursor: params.Cursor = None
 
 
+@ClientMethod(
+    "calibrations",
+    by_place=("spacecraft",),
+    example="""
+    >>> [each.version for each in client.calibrations("XTE")]
+    []
+    """,
+)
 @router.serves(
     "GET /calibrations",
     Policy("read", "query"),
@@ -139,6 +147,7 @@ def list_calibrations(
     return page_response(request, app.part(Calibrations).page(**query.asked()))
 
 
+@ClientMethod("calibrate", by_place=("spacecraft",), omitted=("sample",))
 @router.serves(
     "POST /calibrations",
     Policy("operate", "body"),
@@ -156,6 +165,7 @@ def start_calibration(body: JsonBody, app: AppDep, change: ChangeDep) -> Respons
     return json_response(begun, 202, {"Location": f"/api/v1/calibrations/{begun.id}"})
 
 
+@ClientMethod("calibration")
 @router.serves(
     "GET /calibrations/{id}",
     # A token bound to spacecraft may use calibrations of these only: the handlers check it.
@@ -181,6 +191,7 @@ def try_calibration(id: CalibrationId, body: JsonBody, app: AppDep, caller: Call
     return json_response(app.part(Calibrations).trial(id, **vars(asked), limit_s=COMPARISON_S))
 
 
+@ClientMethod("adopt_calibration")
 @router.serves(
     "POST /calibrations/{id}/adopt",
     Policy("operate", "nothing"),
@@ -198,6 +209,14 @@ def adopt_calibration(
     return json_response(app.part(Calibrations).adopt(id, who, asked.note, change.entry()))
 
 
+@ClientMethod(
+    "calibration_in_force",
+    example="""
+    >>> in_force = client.calibration_in_force("XTE")
+    >>> in_force.calibration, in_force.history
+    (None, [])
+    """,
+)
 @router.serves(
     "GET /spacecraft/{name}/calibration",
     Policy("read", "path"),
@@ -208,6 +227,7 @@ def get_calibration_in_force(name: SpacecraftPath, app: AppDep) -> Response:
     return json_response(app.adoptions.in_force(name))
 
 
+@ClientMethod("revert_calibration", by_place=("to",))
 @router.serves(
     "POST /spacecraft/{name}/calibration/revert",
     Policy("operate", "path"),

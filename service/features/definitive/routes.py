@@ -11,7 +11,7 @@ from starlette.responses import Response
 from service.features.definitive import records
 from service.features.definitive.part import Definitive
 from service.observations.schema import LIVE, RunName, Wire
-from service.web.openapi import LINK, LOCATION, ApiRouter, Returns
+from service.web.openapi import LINK, LOCATION, ApiRouter, ClientMethod, Returns
 from service.web.requests import query_parameters as params
 from service.web.requests.access import (
     AppDep,
@@ -28,6 +28,7 @@ router = ApiRouter("products")
 ROUTERS = (router,)
 
 
+@ClientMethod("live_attitude")
 @router.serves(
     "GET /spacecraft/{name}/attitude/latest",
     Policy("read", "path"),
@@ -41,6 +42,13 @@ def get_live_attitude(name: SpacecraftPath, app: AppDep) -> Response:
     return json_response(app.part(Definitive).live_filter.latest(name))
 
 
+@ClientMethod(
+    "innovations",
+    example="""
+    >>> [row.chi_square for row in client.innovations("XTE")]
+    []
+    """,
+)
 @router.serves(
     "GET /spacecraft/{name}/innovations",
     Policy("read", "path"),
@@ -70,6 +78,7 @@ class DefinitiveIn(Wire):
         return self
 
 
+@ClientMethod("make_definitive_attitude")
 @router.serves(
     "POST /spacecraft/{name}/definitive-attitude",
     Policy("operate", "path"),
@@ -101,6 +110,7 @@ def list_definitive_attitudes(name: SpacecraftPath, app: AppDep) -> Response:
     return json_response(records.DefinitiveJobList(items=app.part(Definitive).jobs.all(name)))
 
 
+@ClientMethod("definitive_attitude")
 @router.serves(
     "GET /spacecraft/{name}/definitive-attitude/{id}",
     Policy("read", "path"),

@@ -10,7 +10,7 @@ from starlette.responses import Response
 from service.features.pictures.part import Pictures
 from service.features.pictures.records import Picture
 from service.vectors import Projection
-from service.web.openapi import ApiRouter, Returns
+from service.web.openapi import ApiRouter, ClientMethod, Returns
 from service.web.requests.access import AppDep, CallerDep, Policy, json_response
 from service.web.requests.query_parameters import FromQuery, Query
 from service.web.requests.request_body import frame_body
@@ -50,6 +50,7 @@ async def _picture(request: Request, query: FromQuery[PictureQuery], app: AppDep
     return await frame_body(request, app.settings.frame_mb << 20)
 
 
+@ClientMethod("solve_picture", body="picture", repeatable=True)
 @router.serves(
     "POST /pictures",
     # It records nothing; the handler asks for access to the spacecraft that is named.

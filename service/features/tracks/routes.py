@@ -8,7 +8,7 @@ from starlette.responses import Response
 
 from service.features.tracks.part import Tracks
 from service.features.tracks.records import TrackList
-from service.web.openapi import ApiRouter, Returns
+from service.web.openapi import ApiRouter, ClientMethod, Returns
 from service.web.requests.access import AppDep, Policy, json_response
 from service.web.requests.query_parameters import FromQuery, PeriodQuery, SpacecraftPath
 
@@ -34,6 +34,14 @@ class TracksQuery(PeriodQuery):
     ] = "json"
 
 
+@ClientMethod(
+    "tracks",
+    example="""
+    >>> [each.kind for each in client.tracks("XTE").items]
+    []
+    """,
+)
+@ClientMethod("tracks_tdm", format="tdm")
 @router.serves(
     "GET /spacecraft/{name}/tracks",
     Policy("read", "path"),

@@ -16,7 +16,15 @@ from service.gyro.blocks import GyroBlockIn
 from service.ingest.submit import MAX_ARRAY, Outcome
 from service.observations.schema import LIVE, BatchIn, Key, OptionsIn, RunName, Wire
 from service.storage.recording.unsaved_result import Answered
-from service.web.openapi import IDEMPOTENCY_KEY, LINK, LOCATION, REPLAYED, ApiRouter, Returns
+from service.web.openapi import (
+    IDEMPOTENCY_KEY,
+    LINK,
+    LOCATION,
+    REPLAYED,
+    ApiRouter,
+    ClientMethod,
+    Returns,
+)
 from service.web.requests import query_parameters as params
 from service.web.requests.access import (
     AppDep,
@@ -137,6 +145,14 @@ def _outcome(request: Request, outcome: Outcome) -> BatchOutcome:
     return BatchOutcome(status=problem.status, answer=None, problem=problem)
 
 
+@ClientMethod(
+    "batches",
+    by_place=("spacecraft",),
+    example="""
+    >>> [found.batch for found in client.batches("XTE")]
+    ['1996-010-0110']
+    """,
+)
 @router.serves(
     "GET /batches", Policy("read", "query"), Returns("A page of results.", BatchPage, LINK)
 )
@@ -145,6 +161,7 @@ def list_batches(request: Request, query: FromQuery[params.BatchQuery], app: App
     return page_response(request, app.results.page(**query.asked()))
 
 
+@ClientMethod("batch")
 @router.serves(
     "GET /batches/{id}", Policy("read", "result"), Returns("The result and its batch.", Result)
 )
@@ -245,6 +262,18 @@ gyro_router = ApiRouter("gyro")
 BlockId = Annotated[str, Path(description="The `id` of a recorded gyro block.")]
 
 
+@ClientMethod(
+    "submit_gyro",
+    body="block",
+    repeatable=True,
+    example="""
+    >>> sorted(block)
+    ['block', 'rates_rad_per_s', 'start', 'step_s']
+    >>> recorded = client.submit_gyro("XTE", block)
+    >>> recorded.end, recorded.samples
+    ('1996-01-10T12:00:00.500Z', 2)
+    """,
+)
 @gyro_router.serves(
     "POST /spacecraft/{name}/gyro",
     Policy("submit", "path"),
@@ -271,6 +300,14 @@ def submit_gyro(name: SpacecraftPath, body: JsonBody, app: AppDep, metrics: Metr
     return json_response(recorded.row, 201, {"Location": location})
 
 
+@ClientMethod(
+    "gyro",
+    example="""
+    >>> recorded = client.submit_gyro("XTE", block)
+    >>> [found.block for found in client.gyro("XTE")]
+    ['g1']
+    """,
+)
 @gyro_router.serves(
     "GET /spacecraft/{name}/gyro",
     Policy("read", "path"),
@@ -286,6 +323,15 @@ def list_gyro(
     return page_response(request, app.gyro.page(name, **query.asked()))
 
 
+@ClientMethod(
+    "gyro_samples",
+    example="""
+    >>> recorded = client.submit_gyro("XTE", block)
+    >>> samples = client.gyro_samples("XTE", recorded.id)
+    >>> samples.times_s, samples.rates_rad_per_s[1]
+    ([0.0, 0.5], [0.0011, 0.0, 1e-05])
+    """,
+)
 @gyro_router.serves(
     "GET /spacecraft/{name}/gyro/{id}",
     Policy("read", "path"),

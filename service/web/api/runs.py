@@ -14,7 +14,7 @@ from service.contract.runs import Forgotten, Replay, ReplayList, RunList, RunSta
 from service.errors import BadBatch, Fault, shown_value
 from service.observations.schema import BatchIn, Key, RunName, Wire
 from service.storage.upkeep.forget import MOST_NAMES, ForgetFilter
-from service.web.openapi import LOCATION, ApiRouter, Returns
+from service.web.openapi import LOCATION, ApiRouter, ClientMethod, Returns
 from service.web.requests import request_body
 from service.web.requests.access import (
     AppDep,
@@ -102,12 +102,14 @@ async def _telemetry(
     return ReplayUpload(query, body)
 
 
+@ClientMethod("runs")
 @router.serves("GET /runs", Policy("read", "nothing"), Returns("Every run.", RunList))
 def list_runs(app: AppDep, caller: CallerDep) -> Response:
     """All runs with batches; for a token bound to spacecraft, runs with their batches."""
     return json_response({"items": app.runs.all(caller.spacecraft)})
 
 
+@ClientMethod("watch_run", defaults={"alarms": True})
 @router.serves(
     "PUT /runs/{run}",
     Policy("submit", audited=True),
@@ -148,6 +150,7 @@ def forget_run(
     return json_response(app.runs.forget(selected, change.entry()))
 
 
+@ClientMethod("replays")
 @router.serves(
     "GET /replays", Policy("read", "nothing"), Returns("The latest hundred replays.", ReplayList)
 )
@@ -206,6 +209,7 @@ def get_replay(id: ReplayId, app: AppDep) -> Response:
     return json_response(app.replays.get(id))
 
 
+@ClientMethod("cancel_replay")
 @router.serves(
     "DELETE /replays/{id}",
     # Of tokens that are bound to spacecraft only the one that started it: see the handler.

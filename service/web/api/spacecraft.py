@@ -9,7 +9,7 @@ from service.contract.answers import Result
 from service.contract.events import RecordHead
 from service.contract.spacecraft import About, Overview
 from service.table_files.formats import JSON_FORMAT, TABLE_FORMATS, write_table
-from service.web.openapi import CONTENT_LOCATION, LINK, ApiRouter, Returns
+from service.web.openapi import CONTENT_LOCATION, LINK, ApiRouter, ClientMethod, Returns
 from service.web.requests import query_parameters as params
 from service.web.requests.access import AppDep, CallerDep, Policy, json_response, page_response
 from service.web.requests.exports import (
@@ -26,6 +26,13 @@ router = ApiRouter("spacecraft")
 DEFAULT_SIZE = 500
 
 
+@ClientMethod(
+    "fleet",
+    example="""
+    >>> [each.name for each in client.fleet() if each.attitude]
+    ['XTE']
+    """,
+)
 @router.serves(
     "GET /spacecraft",
     Policy("read", "nothing"),
@@ -37,6 +44,7 @@ def list_spacecraft(query: FromQuery[params.RunQuery], app: AppDep, caller: Call
     return json_response({"items": theirs})
 
 
+@ClientMethod("spacecraft")
 @router.serves(
     "GET /spacecraft/{name}",
     Policy("read", "path"),
@@ -49,6 +57,13 @@ def get_spacecraft(
     return json_response(app.spacecraft.state(name, query.run))
 
 
+@ClientMethod(
+    "latest",
+    example="""
+    >>> client.latest("XTE").answer.attitude.status
+    'good'
+    """,
+)
 @router.serves(
     "GET /spacecraft/{name}/latest",
     Policy("read", "path"),
@@ -65,6 +80,15 @@ def get_latest(name: SpacecraftPath, query: FromQuery[params.RunQuery], app: App
     )
 
 
+@ClientMethod(
+    "attitudes",
+    example="""
+    >>> [round(row.quaternion[3], 4) for row in client.attitudes("XTE")]
+    [0.3536]
+    >>> client.attitudes("XTE").to_arrow().num_rows
+    1
+    """,
+)
 @router.serves(
     "GET /spacecraft/{name}/attitudes",
     Policy("read", "path"),
@@ -77,6 +101,13 @@ def list_attitudes(
     return page_response(request, app.spacecraft.attitudes(name, **query.asked()))
 
 
+@ClientMethod(
+    "rates",
+    example="""
+    >>> [(each.start, each.observed) for each in client.rates("XTE")]
+    [('1996-01-10T12:00:00.000Z', 4)]
+    """,
+)
 @router.serves(
     "GET /spacecraft/{name}/rates",
     Policy("read", "path"),
@@ -87,6 +118,16 @@ def list_rates(name: SpacecraftPath, query: FromQuery[params.RatesQuery], app: A
     return json_response(models.RateList(items=app.spacecraft.rates(name, **query.asked())))
 
 
+@ClientMethod(
+    "history",
+    by_place=("quantity",),
+    renamed={"quantity": "quantities"},
+    example="""
+    >>> history = client.history("XTE", ["residual_rms_arcsec"])
+    >>> history.to_arrow().column_names[-1]
+    'residual_rms_arcsec.max'
+    """,
+)
 @router.serves(
     "GET /spacecraft/{name}/history",
     Policy("read", "path"),
@@ -129,6 +170,7 @@ def get_history(
     return json_response(history, headers=thinned_header(history.thinned))
 
 
+@ClientMethod("worst", by_place=("by",))
 @router.serves(
     "GET /spacecraft/{name}/worst",
     Policy("read", "path"),

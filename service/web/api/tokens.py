@@ -11,7 +11,7 @@ from service import access
 from service.contract.access import AuditPage, NewToken, Scope, Session, Token, TokenList
 from service.errors import Unauthenticated
 from service.observations.schema import Key, Wire
-from service.web.openapi import LINK, ApiRouter, Returns
+from service.web.openapi import LINK, ApiRouter, ClientMethod, Returns
 from service.web.requests.access import (
     COOKIE,
     OPEN,
@@ -53,6 +53,13 @@ def sign_in(request: Request, body: SessionBody, app: AppDep) -> Response:
     return response
 
 
+@ClientMethod(
+    "session",
+    example="""
+    >>> client.session().scopes
+    ['operate', 'read', 'submit']
+    """,
+)
 @router.serves("GET /session", Policy("read", "nothing"), Returns("The caller.", Session))
 def session(caller: CallerDep) -> Response:
     """Name, scopes and spacecraft of the caller."""
@@ -98,12 +105,14 @@ class TokenIn(Wire):
 TokenName = Annotated[str, Path(max_length=64, description="The `name` of a token.")]
 
 
+@ClientMethod("tokens")
 @router.serves("GET /tokens", OPERATE, Returns("All tokens, without their secrets.", TokenList))
 def list_tokens(app: AppDep) -> Response:
     """All tokens, with scopes, spacecraft, expiry and state."""
     return json_response(TokenList(items=app.tokens.all()))
 
 
+@ClientMethod("create_token", by_place=("name", "scopes"))
 @router.serves(
     "POST /tokens",
     OPERATE,
@@ -119,6 +128,7 @@ def add_token(body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
     return json_response(made, 201)
 
 
+@ClientMethod("revoke_token", renamed={"token": "name"})
 @router.serves(
     "DELETE /tokens/{token}",
     OPERATE,
