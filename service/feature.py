@@ -24,7 +24,8 @@ Nothing outside the folder of a feature imports it.  Its package holds a `Featur
 - `serving`: `serving(app, metrics)`, an asynchronous context manager entered while the service
   serves; `check(settings)` raises `BadConfiguration` before anything is opened.
 - `routes`: `ROUTERS` are its routes of the API; their examples are the file `examples.json` of
-  the package (`python -m tests.web.examples` writes it).
+  the package, which `python -m service.web.examples` writes from the handlers' decorators
+  `Example` and from `send(walk)` of a module `examples`.
 - `pages`: importing it registers its pages of the console; its templates and scripts lie in the
   folders `templates` and `static` of the package.  `PANELS`, if it is there, is what it adds to
   pages of others: functions of the `PageContext` by name of the page, which says what it takes.
@@ -46,22 +47,14 @@ from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
 from importlib.resources import files
+from pathlib import Path
+from pkgutil import iter_modules
 from types import ModuleType
 
 from service.errors import BadConfiguration, shown_value
 
-SHIPPED = (
-    "advice",
-    "alarms",
-    "calibration",
-    "definitive",
-    "follow",
-    "packets",
-    "pictures",
-    "products",
-    "tracks",
-    "webhooks",
-)
+_FOLDER = str(Path(__file__).with_name("features"))
+SHIPPED = tuple(sorted(each.name for each in iter_modules([_FOLDER])))
 """Names of the features in this package, in the order of their routes and commands."""
 
 KINDS = (

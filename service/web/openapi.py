@@ -144,6 +144,29 @@ class ClientMethod:
         return handler
 
 
+@dataclass(frozen=True)
+class Example:
+    """Request of a route that the OpenAPI document shows with its answer.
+
+    `python -m service.web.examples` sends it after the first batches.  `path` has values for the
+    names in the path, `body` is sent as JSON.  A request that needs others before it is sent by
+    the module `examples` of its feature instead.
+    """
+
+    name: str
+    query: str = ""
+    path: Mapping[str, str] = field(default_factory=lambda: {"name": "XTE"})
+    body: Mapping[str, Any] | None = None
+
+    def __call__(self, handler: Handler) -> Handler:
+        """Add an example to the route of the decorated handler."""
+        EXAMPLE_REQUESTS.setdefault(handler.__name__, []).insert(0, self)
+        return handler
+
+
+EXAMPLE_REQUESTS: dict[str, list[Example]] = {}
+"""Requests whose answers are examples of a route, by the name of its handler."""
+
 CLIENT_METHODS: dict[str, list[tuple[Callable[..., Any], ClientMethod]]] = {}
 """Methods of the Python client for each route, with its handler, by the name of the handler."""
 

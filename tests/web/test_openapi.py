@@ -13,9 +13,9 @@ from service.observations.schema import submission_from_json
 from service.storage.recording.events import EVENT_KINDS
 from service.storage.sql.tables import events
 from service.web.app import bare_app, openapi_yaml
+from service.web.examples import fresh_walk
 from service.web.openapi import examples
 from tests.web.conformance import FILE, reference, validator
-from tests.web.examples import fresh_walk
 
 OPERATIONS = [
     (path, method, operation)
@@ -172,7 +172,7 @@ def test_every_route_that_answers_json_has_examples_of_its_success():
 def test_the_examples_are_what_the_app_still_answers():
     """Numbers that differ from run to run aside."""
     found = fresh_walk()
-    assert shape(found) == shape(examples()), "run: python -m tests.web.examples && make openapi"
+    assert shape(found) == shape(examples()), "run: python -m service.web.examples && make openapi"
 
 
 def shape(value):

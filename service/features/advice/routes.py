@@ -9,7 +9,7 @@ from starlette.responses import Response
 from service.features.advice.part import ADVICE_SAMPLE, AdviceService
 from service.features.advice.records import Advice
 from service.observations.schema import tolerances_from_text
-from service.web.openapi import ApiRouter, Returns
+from service.web.openapi import ApiRouter, Example, Returns
 from service.web.requests.access import AppDep, Policy, json_response
 from service.web.requests.query_parameters import FromQuery, PeriodQuery, SpacecraftPath
 
@@ -49,6 +49,8 @@ class AdviceQuery(PeriodQuery):
         return asked | {"tolerances": tolerances_from_text(asked.pop("tolerance"), "tolerance")}
 
 
+@Example("of_two_batches", "tolerance=separation_deg=0.01")
+@Example("tolerance", "tolerance=septol=1")
 @router.serves(
     "GET /spacecraft/{name}/advice",
     Policy("read", "path"),

@@ -11,7 +11,7 @@ from starlette.responses import Response
 from service.features.definitive import records
 from service.features.definitive.part import Definitive
 from service.observations.schema import LIVE, RunName, Wire
-from service.web.openapi import LINK, LOCATION, ApiRouter, ClientMethod, Returns
+from service.web.openapi import LINK, LOCATION, ApiRouter, ClientMethod, Example, Returns
 from service.web.requests import query_parameters as params
 from service.web.requests.access import (
     AppDep,
@@ -29,6 +29,7 @@ ROUTERS = (router,)
 
 
 @ClientMethod("live_attitude")
+@Example("not_kept_up")
 @router.serves(
     "GET /spacecraft/{name}/attitude/latest",
     Policy("read", "path"),
@@ -49,6 +50,7 @@ def get_live_attitude(name: SpacecraftPath, app: AppDep) -> Response:
     []
     """,
 )
+@Example("none_smoothed")
 @router.serves(
     "GET /spacecraft/{name}/innovations",
     Policy("read", "path"),

@@ -19,7 +19,7 @@ from service.features.products.part import Products, TableKind
 from service.missions.product_settings import MAX_LARGEST_GAP_S, MIN_NAIF_ID, OBJECT_ID
 from service.table_files.formats import JSON_FORMAT, TABLE_FORMATS, write_table
 from service.trends.quantities import OneOf
-from service.web.openapi import FORMATS_OF, ApiRouter, Returns
+from service.web.openapi import FORMATS_OF, ApiRouter, Example, Returns
 from service.web.requests import query_parameters as params
 from service.web.requests.access import AppDep, CallerDep, Policy, json_response
 from service.web.requests.exports import ExportsDep, attached_as
@@ -124,6 +124,7 @@ class TableQuery(params.PeriodQuery):
     ] = "csv"
 
 
+@Example("one", path={"name": "SWAS"})
 @router.serves(
     "GET /spacecraft/{name}/attitude",
     Policy("read", "path"),
@@ -155,6 +156,8 @@ def get_attitude(
     )
 
 
+@Example("nearest", "status=all&method=nearest&time=1999-060T00:00:05Z", path={"name": "SWAS"})
+@Example("none", "status=all&method=nearest&time=1999-061T00:00:00Z", path={"name": "SWAS"})
 @router.serves(
     "GET /spacecraft/{name}/attitude/at",
     Policy("read", "path"),

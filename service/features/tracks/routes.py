@@ -8,7 +8,7 @@ from starlette.responses import Response
 
 from service.features.tracks.part import Tracks
 from service.features.tracks.records import TrackList
-from service.web.openapi import ApiRouter, ClientMethod, Returns
+from service.web.openapi import ApiRouter, ClientMethod, Example, Returns
 from service.web.requests.access import AppDep, Policy, json_response
 from service.web.requests.query_parameters import FromQuery, PeriodQuery, SpacecraftPath
 
@@ -42,6 +42,7 @@ class TracksQuery(PeriodQuery):
     """,
 )
 @ClientMethod("tracks_tdm", format="tdm")
+@Example("format", "run=none&format=aem")
 @router.serves(
     "GET /spacecraft/{name}/tracks",
     Policy("read", "path"),

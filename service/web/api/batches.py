@@ -23,6 +23,7 @@ from service.web.openapi import (
     REPLAYED,
     ApiRouter,
     ClientMethod,
+    Example,
     Returns,
 )
 from service.web.requests import query_parameters as params
@@ -153,6 +154,9 @@ def _outcome(request: Request, outcome: Outcome) -> BatchOutcome:
     ['1996-010-0110']
     """,
 )
+@Example("first_page", "spacecraft=XTE&limit=1")
+@Example("by_batch_id", "spacecraft=XTE&batch=1999-060-0003")
+@Example("limit", "limit=ten")
 @router.serves(
     "GET /batches", Policy("read", "query"), Returns("A page of results.", BatchPage, LINK)
 )
@@ -231,6 +235,14 @@ class CompareIn(Wire):
     b: SideOptions = OptionsIn()
 
 
+@Example(
+    "tighter",
+    body={
+        "spacecraft": "XTE",
+        "sample": 5,
+        "b": {"identifier": "starid", "tolerances": {"separation_deg": 1e-5}},
+    },
+)
 @compare_router.serves(
     "POST /compare",
     Policy("read", "body"),

@@ -9,7 +9,7 @@ from service.contract.answers import Result
 from service.contract.events import RecordHead
 from service.contract.spacecraft import About, Overview
 from service.table_files.formats import JSON_FORMAT, TABLE_FORMATS, write_table
-from service.web.openapi import CONTENT_LOCATION, LINK, ApiRouter, ClientMethod, Returns
+from service.web.openapi import CONTENT_LOCATION, LINK, ApiRouter, ClientMethod, Example, Returns
 from service.web.requests import query_parameters as params
 from service.web.requests.access import AppDep, CallerDep, Policy, json_response, page_response
 from service.web.requests.exports import (
@@ -33,6 +33,7 @@ DEFAULT_SIZE = 500
     ['XTE']
     """,
 )
+@Example("all")
 @router.serves(
     "GET /spacecraft",
     Policy("read", "nothing"),
@@ -45,6 +46,8 @@ def list_spacecraft(query: FromQuery[params.RunQuery], app: AppDep, caller: Call
 
 
 @ClientMethod("spacecraft")
+@Example("soho", path={"name": "SOHO"})
+@Example("unknown", path={"name": "NOPE"})
 @router.serves(
     "GET /spacecraft/{name}",
     Policy("read", "path"),
@@ -64,6 +67,8 @@ def get_spacecraft(
     'good'
     """,
 )
+@Example("soho", path={"name": "SOHO"})
+@Example("empty_run", "run=none")
 @router.serves(
     "GET /spacecraft/{name}/latest",
     Policy("read", "path"),
@@ -89,6 +94,7 @@ def get_latest(name: SpacecraftPath, query: FromQuery[params.RunQuery], app: App
     1
     """,
 )
+@Example("one", path={"name": "SWAS"})
 @router.serves(
     "GET /spacecraft/{name}/attitudes",
     Policy("read", "path"),
@@ -108,6 +114,7 @@ def list_attitudes(
     [('1996-01-10T12:00:00.000Z', 4)]
     """,
 )
+@Example("one_hour")
 @router.serves(
     "GET /spacecraft/{name}/rates",
     Policy("read", "path"),
@@ -128,6 +135,8 @@ def list_rates(name: SpacecraftPath, query: FromQuery[params.RatesQuery], app: A
     'residual_rms_arcsec.max'
     """,
 )
+@Example("one_bucket", "quantity=residual_ratio&size=10")
+@Example("latest_batch", "strategy=latest&quantity=ambiguous_share&size=1")
 @router.serves(
     "GET /spacecraft/{name}/history",
     Policy("read", "path"),
@@ -171,6 +180,7 @@ def get_history(
 
 
 @ClientMethod("worst", by_place=("by",))
+@Example("by_ambiguous_share", "limit=1")
 @router.serves(
     "GET /spacecraft/{name}/worst",
     Policy("read", "path"),
@@ -184,6 +194,7 @@ def list_worst(name: SpacecraftPath, query: FromQuery[params.WorstQuery], app: A
 overview_router = ApiRouter("spacecraft")
 
 
+@Example("live")
 @overview_router.serves(
     "GET /overview", Policy("read", "nothing"), Returns("Every spacecraft in the run.", Overview)
 )
@@ -192,6 +203,7 @@ def get_overview(query: FromQuery[params.RunQuery], app: AppDep, caller: CallerD
     return json_response(app.spacecraft.overview(query.run, caller.spacecraft))
 
 
+@Example("here")
 @overview_router.serves(
     "GET /about",
     Policy("read", "nothing"),
@@ -202,6 +214,7 @@ def get_about(app: AppDep, caller: CallerDep) -> Response:
     return json_response(app.service.about(caller.spacecraft))
 
 
+@Example("first")
 @overview_router.serves(
     "GET /record/head",
     Policy("read", "nothing"),

@@ -11,7 +11,7 @@ from service import access
 from service.contract.access import AuditPage, NewToken, Scope, Session, Token, TokenList
 from service.errors import Unauthenticated
 from service.observations.schema import Key, Wire
-from service.web.openapi import LINK, ApiRouter, ClientMethod, Returns
+from service.web.openapi import LINK, ApiRouter, ClientMethod, Example, Returns
 from service.web.requests.access import (
     COOKIE,
     OPEN,
@@ -60,6 +60,7 @@ def sign_in(request: Request, body: SessionBody, app: AppDep) -> Response:
     ['operate', 'read', 'submit']
     """,
 )
+@Example("open_access")
 @router.serves("GET /session", Policy("read", "nothing"), Returns("The caller.", Session))
 def session(caller: CallerDep) -> Response:
     """Name, scopes and spacecraft of the caller."""
