@@ -5,6 +5,7 @@ on, and the versions of the libraries that compute them.  A section is stale whe
 the digest of the same files is another one today.
 """
 
+import ast
 import hashlib
 import os
 import platform
@@ -12,6 +13,7 @@ import re
 import subprocess
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 
@@ -97,7 +99,11 @@ def commit_of(sources: Sequence[str]) -> str:
 
 
 def digest_of(sources: Iterable[str]) -> str:
-    """A digest of files and of all files in folders, by their paths and their bytes."""
+    """A digest of files and of all files in folders, by their paths and their contents.
+
+    The content of a Python file is its syntax: other comments, docstrings or lines measure nothing
+    else.
+    """
     digest, used = hashlib.sha256(), list(sources)
     left_out = [ROOT / each.removeprefix(":!") for each in used if each.startswith(":!")]
     found = {path for each in used if not each.startswith(":!") for path in _files(ROOT / each)}
@@ -105,8 +111,37 @@ def digest_of(sources: Iterable[str]) -> str:
         if any(path.is_relative_to(each) for each in left_out):
             continue
         digest.update(f"{os.path.relpath(path, ROOT)}\0".encode())
-        digest.update(hashlib.sha256(path.read_bytes()).digest())
+        digest.update(_content_digest(path))
     return digest.hexdigest()[:16]
+
+
+@cache
+def _content_digest(path: Path) -> bytes:
+    content = path.read_bytes()
+    if path.suffix == ".py":
+        content = repr(_syntax(ast.parse(content))).encode()
+    return hashlib.sha256(content).digest()
+
+
+def _syntax(node: object) -> object:
+    """Syntax without texts that stand alone; the same for every supported Python.
+
+    `ast.dump` is not: later versions add fields that are empty, or leave out empty ones.
+    """
+    if isinstance(node, list):
+        return [_syntax(each) for each in node if not _is_lone_text(each)]
+    if not isinstance(node, ast.AST):
+        return node
+    fields = [(name, _syntax(value)) for name, value in ast.iter_fields(node)]
+    return type(node).__name__, [each for each in fields if each[1] not in (None, [])]
+
+
+def _is_lone_text(node: object) -> bool:
+    return (
+        isinstance(node, ast.Expr)
+        and isinstance(node.value, ast.Constant)
+        and isinstance(node.value.value, str)
+    )
 
 
 def _files(source: Path) -> Iterator[Path]:
