@@ -124,9 +124,9 @@ def _content_digest(path: Path) -> bytes:
 
 
 def _syntax(node: object) -> object:
-    """Syntax without texts that stand alone; the same for every supported Python.
+    """Syntax without texts that stand alone, and without empty fields.
 
-    `ast.dump` is not: later versions add fields that are empty, or leave out empty ones.
+    `ast.dump` shows empty fields or leaves them out, which depends on the version of Python.
     """
     if isinstance(node, list):
         return [_syntax(each) for each in node if not _is_lone_text(each)]

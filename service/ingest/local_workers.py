@@ -370,6 +370,7 @@ def _start(config: WorkerConfig, work: Callable[..., Any]) -> _Worker:
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([worker_process.__name__])
     # Python 3.11.0 would have the server listen where every local user can connect.
+    # The types of the standard library call it final.
     util.abstract_sockets_supported = False  # type: ignore[misc]
     own, other = context.Pipe()
     process = context.Process(

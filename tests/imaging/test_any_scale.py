@@ -9,32 +9,17 @@ import tifffile
 from astropy.io import fits
 from PIL import Image
 
-from service.acquire.picture import blind_sky, solve_picture
-from service.identify.blind.lens import Lens
-from service.identify.blind.solver import focal_px_of
+from service.acquire.picture import solve_picture
 from service.imaging.detection.detect import detect
 from service.imaging.detection.measure import measure
 from service.imaging.detection.points import find_points, hot_pixels
 from service.imaging.frames.files import read_frame
 from service.imaging.frames.frame import Frame, FrameLimits
 from service.simulate.frames import FrameSettings, draw_frames
-from service.sky.catalog.star_catalog import load_embedded
-from tests.features.pictures.drawn import draw_picture
 from tests.scale import draws
 
 LIMITS = FrameLimits(2_000_000)
 SIDE = 640, 480
-
-
-@pytest.fixture(scope="module")
-def blind():
-    return blind_sky(load_embedded(), 2020)
-
-
-@pytest.fixture(scope="module")
-def picture(blind):
-    lens = Lens(*SIDE, focal_px_of(SIDE[0], 14.0))
-    return draw_picture(np.random.default_rng(5), blind[0], stars=60, quality=None, lens=lens)
 
 
 @pytest.fixture(scope="module")

@@ -11,14 +11,10 @@ import tifffile
 from astropy.io import fits
 from PIL import Image
 
-from service.acquire.picture import blind_sky, solve_picture
+from service.acquire.picture import solve_picture
 from service.errors import BadFile
-from service.identify.blind.lens import Lens
-from service.identify.blind.solver import focal_px_of
 from service.imaging.frames.files import read_frame
 from service.imaging.frames.frame import FrameLimits
-from service.sky.catalog.star_catalog import load_embedded
-from tests.features.pictures.drawn import draw_picture
 from tests.mutations import with_right_sums
 from tests.scale import size
 
@@ -35,17 +31,6 @@ FITS_WORDS = (
     *(b"BZERO", b"BSCALE", b"BLANK", b"ROWORDER"),
 )
 END = b"END".ljust(80)
-
-
-@pytest.fixture(scope="module")
-def blind():
-    return blind_sky(load_embedded(), 2020)
-
-
-@pytest.fixture(scope="module")
-def picture(blind):
-    lens = Lens(640, 480, focal_px_of(640, 14.0))
-    return draw_picture(np.random.default_rng(5), blind[0], stars=60, quality=None, lens=lens)
 
 
 def saved(counts, file_format, **more):

@@ -20,6 +20,7 @@ from service.features.advice.innovations import (
     innovation_findings,
     innovation_noise,
 )
+from service.features.advice.prior_errors import latest_prior_errors
 from service.features.advice.statements import (
     Statement,
     alignment_statement,
@@ -48,7 +49,6 @@ from service.storage.queries.pages import ResultFilter, latest_time
 from service.storage.queries.period import sample_period
 from service.storage.queries.results import BatchSample, sample_batches
 from service.storage.queries.time_buckets import BucketFilter
-from service.storage.queries.trends import latest_prior_errors
 from service.times import DAY_S, Utc, recorded_utc, shifted, utc_now
 
 ADVICE_SAMPLE = 200

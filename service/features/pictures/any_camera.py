@@ -16,6 +16,8 @@ from service.errors import BadInput, Fault, printable, shown_value
 from service.settings import Settings
 
 if TYPE_CHECKING:
+    from argparse import _ArgumentGroup as ArgumentGroup  # it has no public name
+
     from service.acquire.picture import PictureResult
     from service.imaging.frames.frame import Frame
 
@@ -31,16 +33,23 @@ def extend(parser: ArgumentParser) -> None:
         "without a spacecraft",
         "known data of any camera; values of its lens may be wrong by a quarter",
     )
-    lens.add_argument("--fov", type=degrees, metavar="DEG", help="field of view, the longer side")
+    add_camera_options(lens)
     lens.add_argument(
         "--lens",
         choices=("gnomonic", "equidistant", "equisolid", "stereographic"),
         help="projection: gnomonic (on a plane) or of a fisheye; default: whatever fits",
     )
-    lens.add_argument("--focal-px", type=positive, metavar="PX", help="focal length in pixels")
-    lens.add_argument("--focal-mm", type=positive, metavar="MM", help="with --pixel-um")
-    lens.add_argument("--pixel-um", type=positive, metavar="UM", help="the pitch of the pixels")
-    lens.add_argument(
+
+
+def add_camera_options(options: "ArgumentParser | ArgumentGroup") -> None:
+    """Declare the options that `focal_guess_px` and `picture_reader` take."""
+    options.add_argument(
+        "--fov", type=degrees, metavar="DEG", help="field of view, the longer side"
+    )
+    options.add_argument("--focal-px", type=positive, metavar="PX", help="focal length in pixels")
+    options.add_argument("--focal-mm", type=positive, metavar="MM", help="with --pixel-um")
+    options.add_argument("--pixel-um", type=positive, metavar="UM", help="the pitch of the pixels")
+    options.add_argument(
         "--dark", type=Path, metavar="FILE", help="a frame of the same exposure without light"
     )
 

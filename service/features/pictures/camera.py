@@ -5,8 +5,9 @@ from argparse import Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from service.cli.arguments import add_command, add_group, degrees, positive, settings_of
+from service.cli.arguments import add_command, add_group, settings_of
 from service.errors import BadInput, Fault, printable, shown_value
+from service.features.pictures.any_camera import add_camera_options, focal_guess_px, picture_reader
 
 if TYPE_CHECKING:
     from service.acquire.picture import PictureResult
@@ -30,13 +31,7 @@ def add(commands: Any) -> None:
         "-o", "--output", type=Path, required=True, metavar="CAMERA.toml", help="mission file"
     )
     parser.add_argument("--name", metavar="NAME", help="mission name; default: from the output")
-    parser.add_argument("--fov", type=degrees, metavar="DEG", help="rough field of view")
-    parser.add_argument("--focal-px", type=positive, metavar="PX", help="rough focal length")
-    parser.add_argument("--focal-mm", type=positive, metavar="MM", help="with --pixel-um")
-    parser.add_argument("--pixel-um", type=positive, metavar="UM", help="pixel pitch")
-    parser.add_argument(
-        "--dark", type=Path, metavar="FILE", help="a frame of the same exposure without light"
-    )
+    add_camera_options(parser)
 
 
 def run(parsed: Namespace) -> int:
@@ -76,7 +71,6 @@ def _solved(
 ) -> list["PictureResult"]:
     """Solve the pictures; reports those without an attitude or mirrored, and returns the others."""
     from service.acquire.picture import solve_picture
-    from service.features.pictures.any_camera import focal_guess_px, picture_reader
 
     read = picture_reader(parsed.dark, settings)
     used: list[PictureResult] = []

@@ -1,6 +1,5 @@
 """Histories of quantities, reduced to a chart's points with extremes kept; and worst batches."""
 
-import math
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ from service.storage.queries.time_buckets import BucketFilter, Columns
 from service.storage.recording.result_metrics import OF_TRACKERS, value_sql
 from service.storage.sql import tables
 from service.storage.sql.columns import Row
-from service.storage.sql.tables import batches, results, solutions, tracker_values
+from service.storage.sql.tables import batches, results, tracker_values
 from service.times import DAY_S, HOUR_S, Utc, bucket_start, shifted, unix_seconds, utc_now
 from service.trends.limits import Sample
 from service.trends.measures import BatchShare, Rate, StarShare
@@ -446,24 +445,6 @@ def _shown(
         values = {row["id"]: dict(row) for row in connection.execute(own).mappings()}
     value_of: Any = QUANTITIES[by].value_of
     return [RankedBatch(**summary_fields(rows[id]), value=value_of(values[id])) for id in ids]
-
-
-def latest_prior_errors(
-    connection: Connection, selected: ResultFilter, limit: int
-) -> tuple[list[float], list[float]]:
-    """Angles in degrees from a priori to found attitudes of the latest batches, and their sigmas.
-
-    They are in order from the newest batch; batches without either are left out.
-    """
-    angle_deg, columns = results.c.a_priori_angle_deg, solutions.c
-    variance_arcsec2 = columns.p11 + columns.p22 + columns.p33
-    query = (
-        select(angle_deg, variance_arcsec2.label("variance_arcsec2"))
-        .join_from(results, solutions, columns.result_id == results.c.id)
-        .where(*selected.conditions(), angle_deg.is_not(None))
-    )
-    rows = connection.execute(newest_first(query).limit(limit)).all()
-    return [row[0] for row in rows], [math.sqrt(row[1]) / 3600.0 for row in rows]
 
 
 def latest_samples(

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from service.acquire.frame_submission import submit_frame
-from service.acquire.picture import blind_sky, solve_picture
+from service.acquire.picture import solve_picture
 from service.cli import main
 from service.errors import BadBatch, BadConfiguration
 from service.features.pictures.camera_calibration import calibrate_camera
@@ -35,11 +35,6 @@ width_px = 1024
 height_px = 768
 field_of_view_deg = {field}
 """
-
-
-@pytest.fixture(scope="module")
-def blind():
-    return blind_sky(load_embedded(), 2020)
 
 
 @pytest.fixture(scope="module")

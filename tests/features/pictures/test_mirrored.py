@@ -7,30 +7,15 @@ import pytest
 from astropy.io import fits
 from PIL import Image
 
-from service.acquire.picture import blind_sky, solve_picture
+from service.acquire.picture import solve_picture
 from service.features.pictures.overlay import overlay_of
-from service.identify.blind.lens import Lens
-from service.identify.blind.solver import focal_px_of
 from service.imaging.detection.points import find_points
 from service.imaging.frames.files import read_frame
 from service.imaging.frames.frame import Frame, FrameLimits
-from service.sky.catalog.star_catalog import load_embedded
 from service.vectors import attitude_error_arcsec
-from tests.features.pictures.drawn import draw_picture, middle_attitude
+from tests.features.pictures.drawn import middle_attitude
 
 LIMITS = FrameLimits(10_000_000)
-
-
-@pytest.fixture(scope="module")
-def blind():
-    return blind_sky(load_embedded(), 2020)
-
-
-@pytest.fixture(scope="module")
-def picture(blind):
-    """A picture with plenty of stars."""
-    lens = Lens(640, 480, focal_px_of(640, 14.0))
-    return draw_picture(np.random.default_rng(5), blind[0], stars=60, quality=None, lens=lens)
 
 
 def png(counts, **more):

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 from scipy.stats import chi2
 
-from service.acquire.picture import MOST_SIGMA_SHARE, blind_sky, solve_picture
+from service.acquire.picture import MOST_SIGMA_SHARE, solve_picture
 from service.cli import main
 from service.errors import BadFile
 from service.features.pictures.overlay import overlay_of
@@ -19,7 +19,6 @@ from service.identify.blind.verify import Points
 from service.imaging.detection.points import find_points
 from service.imaging.frames.files import read_frame
 from service.imaging.frames.frame import Frame, FrameLimits
-from service.sky.catalog.star_catalog import load_embedded
 from service.vectors import ARCSEC_PER_RADIAN, attitude_error_arcsec
 from tests.features.pictures.drawn import draw_picture, jpeg_of, middle_attitude
 from tests.scale import draws
@@ -27,11 +26,6 @@ from tests.scale import draws
 FOLDER = Path(__file__).parent
 TRUTH = json.loads((FOLDER / "truth.json").read_text())["pictures"]
 DRAWN = 16
-
-
-@pytest.fixture(scope="module")
-def blind():
-    return blind_sky(load_embedded(), 2020)
 
 
 def frame_of(counts):

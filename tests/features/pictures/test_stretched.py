@@ -7,13 +7,12 @@ import pytest
 from PIL import Image
 from scipy.stats import chi2
 
-from service.acquire.picture import blind_sky, solve_picture
+from service.acquire.picture import solve_picture
 from service.identify.blind.lens import Lens
 from service.identify.blind.solver import focal_px_of
 from service.imaging.detection.clipped import clipped_stars
 from service.imaging.detection.points import find_points, without_dark
 from service.imaging.frames.frame import Frame
-from service.sky.catalog.star_catalog import load_embedded
 from service.vectors import ARCSEC_PER_RADIAN, attitude_error_arcsec
 from tests.features.pictures.drawn import draw_picture, jpeg_of, middle_attitude
 from tests.scale import draws
@@ -21,9 +20,7 @@ from tests.scale import draws
 WIDTH, HEIGHT = 1200, 800
 
 
-@pytest.fixture(scope="module")
-def blind():
-    return blind_sky(load_embedded(), 2026)
+YEAR = 2026
 
 
 def frame_of(counts):

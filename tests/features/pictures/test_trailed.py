@@ -7,13 +7,12 @@ import pytest
 from astropy.io import fits
 from scipy.spatial import cKDTree
 
-from service.acquire.picture import blind_sky, solve_picture
+from service.acquire.picture import solve_picture
 from service.identify.blind.lens import Lens
 from service.identify.blind.solver import focal_px_of
 from service.imaging.detection.points import find_points
 from service.imaging.frames.files import read_frame
 from service.imaging.frames.frame import FrameLimits
-from service.sky.catalog.star_catalog import load_embedded
 from service.vectors import ARCSEC_PER_RADIAN, attitude_error_arcsec
 from tests.features.pictures.drawn import middle_attitude
 from tests.features.pictures.trailed import draw_trailed
@@ -24,9 +23,7 @@ NARROW = Lens(1200, 800, focal_px_of(1200, 20.0))
 HALF_CIRCLE = np.linspace(-1.0, 1.0, 100)
 
 
-@pytest.fixture(scope="module")
-def blind():
-    return blind_sky(load_embedded(), 2026)
+YEAR = 2026
 
 
 def frame_of(picture):

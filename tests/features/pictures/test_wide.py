@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.acquire.picture import blind_sky, solve_picture
+from service.acquire.picture import solve_picture
 from service.cli import main
 from service.identify.blind.lens import PARAMETERS, PROJECTIONS, Lens, lens_of, linearised
 from service.identify.blind.solver import focal_px_of
 from service.imaging.frames.frame import Frame
-from service.sky.catalog.star_catalog import load_embedded
 from service.vectors import attitude_error_arcsec, rotate_about
 from tests.features.pictures.trailed import add_path
 from tests.scale import draws
@@ -26,9 +25,7 @@ RADIUS = {
 WIDTH, HEIGHT, PSF_PX, NOISE = 1200, 800, 1.2, 7.0
 
 
-@pytest.fixture(scope="module")
-def blind():
-    return blind_sky(load_embedded(), 2026)
+YEAR = 2026
 
 
 def drawn(sky, kind, field_deg, faintest_mag, seed, stretch=(1.0, 1.0)):
