@@ -34,7 +34,8 @@ _J2000_MJD = 51544
 _J2000_JD = 2451545.0
 _DAYS_PER_JULIAN_YEAR = 365.25
 _MJD_ZERO_JD = 2400000.5
-_TT_LESS_TAI_D = 32.184 / DAY_S
+TT_LESS_TAI_S = 32.184
+"""Offset of Terrestrial Time from TAI, in seconds (IAU 1991 resolution A4)."""
 _UNIX_J2000_S = 946_728_000
 _TEXT = re.compile(
     r"(?P<year>\d{4})-(?:(?P<month>\d{2})-(?P<day>\d{2})|(?P<doy>\d{3}))"
@@ -112,7 +113,7 @@ class Utc:
         else:
             tai1, tai2 = map(float, ufunc.utctai(self.jd1, self.jd2)[:2])
         # `taitt` would add the same constant to the second, smaller part.
-        return tai1, tai2 + _TT_LESS_TAI_D
+        return tai1, tai2 + TT_LESS_TAI_S / DAY_S
 
     @property
     def julian_year(self) -> float:

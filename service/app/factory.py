@@ -8,6 +8,7 @@ from service.acquire.kernel_build import KernelBuild
 from service.app.adoptions import CalibrationAdoptions
 from service.app.annotations import Annotations
 from service.app.context import Context
+from service.app.fleet import Spacecraft
 from service.app.frames import Frames
 from service.app.gyro import Gyro
 from service.app.replays import Replays
@@ -15,7 +16,6 @@ from service.app.results import Comparisons, Results
 from service.app.runs import Runs
 from service.app.service import Events, Service
 from service.app.single_projector import SingleProjector
-from service.app.spacecraft import Spacecraft
 from service.app.zones import Zones
 from service.feature import SETTING, feature_modules
 from service.ingest.missions_in_force import MissionsInForce

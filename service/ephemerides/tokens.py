@@ -15,7 +15,7 @@ from xml.parsers import expat
 from service.ephemerides.attitude_types import SEQUENCES
 from service.ephemerides.known import MOST_RECORDS
 from service.errors import BadFile, BadInput, Fault, shown_value
-from service.times import FIRST_YEAR, LAST_YEAR, parse_utc
+from service.times import FIRST_YEAR, LAST_YEAR, TT_LESS_TAI_S, parse_utc
 
 MAX_LINE_BYTES = 4096
 _PIECE_BYTES = 1 << 16
@@ -273,7 +273,7 @@ class _XmlReader:
         self._text, self._size = [], 0
 
 
-_LESS_TAI_NS = {"TAI": 0, "GPS": -19 * 10**9, "TT": 32_184_000_000}
+_LESS_TAI_NS = {"TAI": 0, "GPS": -19 * 10**9, "TT": round(TT_LESS_TAI_S * 1e9)}
 """Nanoseconds by which each uniform time system is ahead of TAI, by name."""
 TIME_SYSTEMS = ("UTC", *_LESS_TAI_NS)
 _J2000 = datetime(2000, 1, 1, 12)

@@ -204,6 +204,7 @@ def matched_vectors(
     return found
 
 
+# numba derives the types of its arguments from those of each call.
 @njit(error_model="numpy")
 def _matched_vectors(  # type: ignore[no-untyped-def]
     direction_body, sigma_rad, star, catalog_direction, velocity, sun_distance_au

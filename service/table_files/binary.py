@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from service.table_files.spool import pieces, spool
 from service.table_files.table import Column, Page, Table
-from service.times import DAY_S
+from service.times import DAY_S, TT_LESS_TAI_S
 
 ROWS_IN_GROUP = 1 << 14
 """Number of rows in a Parquet row group, held in memory until written."""
@@ -102,7 +102,7 @@ class _Sink:
 
 BLOCK = 2880
 NULL = -(2**63)
-_TT_LESS_TAI_NS = 32_184_000_000
+_TT_LESS_TAI_NS = round(TT_LESS_TAI_S * 1e9)
 _DAY_NS = DAY_S * 10**9
 _J2000_MJD = 51_544
 _FORMATS = {"number": ("D", ">f8"), "integer": ("K", ">i8"), "flag": ("L", "S1")}

@@ -73,7 +73,7 @@ class SpacecraftMethods:
         strategy: str | None = None,
         size: int | None = None,
     ) -> Call[models.History]:
-        """Quantities over a period.
+        """Histories of quantities over a period.
 
         Thinned out to as many points as can be drawn, or as a table of every batch.
 
@@ -135,7 +135,7 @@ class SpacecraftMethods:
         end: Time | None = None,
         bucket: str = "hour",
     ) -> Call[list[models.Rates]]:
-        """Stars by outcome, in at most 20,000 buckets of batch time.
+        """Numbers of stars by outcome, in at most 20,000 buckets of batch time.
 
         - `spacecraft`: The spacecraft's name, such as `XTE`.
         - `run`: The run; `live` for the batches of pipelines.

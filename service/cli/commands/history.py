@@ -31,7 +31,7 @@ def run(parsed: Namespace) -> int:
     acquire history --spacecraft XTE --run pass-7 --start 1996-010T00:00:00Z
     """
     from service.app.factory import open_app
-    from service.app.spacecraft import batch_table
+    from service.app.fleet import batch_table
 
     start, end = period_of(parsed)
     with closing(open_app(settings_of_existing(parsed), reads_only=True)) as app:

@@ -13,7 +13,7 @@ from service.features.advice.part import AdviceService, best_setting, no_changes
 from service.features.advice.routes import ADVICE_LIMIT_S, MAX_SAMPLE, AdviceQuery
 from service.missions.mission import Tolerances
 from service.web.console.page import ContextDep, FromQuery, PageContext, Panel, console_page
-from service.web.console.pages.spacecraft import PeriodBefore, ShownPeriod
+from service.web.console.pages.spacecraft_page import PeriodBefore, ShownPeriod
 from service.web.requests.access import Policy
 
 FIRST_SAMPLE, FIRST_LIMIT_S = 60, 1.5

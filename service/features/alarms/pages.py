@@ -27,7 +27,7 @@ from service.web.console.page import (
     SortedQuery,
     console_page,
 )
-from service.web.console.pages.spacecraft import (
+from service.web.console.pages.spacecraft_page import (
     DrawnLimits,
     ShownPeriod,
     charts_by_quantity,

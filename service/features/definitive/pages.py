@@ -12,7 +12,7 @@ from service.storage.queries.definitive import MOST_BLOCKS
 from service.web.console.charts.panels import TimeAxis
 from service.web.console.page import ContextDep, FromQuery, console_page
 from service.web.console.pages.period import without_gyro
-from service.web.console.pages.spacecraft import RANGES_S, SpacecraftQuery, shown_period
+from service.web.console.pages.spacecraft_page import RANGES_S, SpacecraftQuery, shown_period
 from service.web.requests.access import Policy
 
 JOBS = 8

@@ -20,6 +20,7 @@ from service.ephemerides.text_kernels import leap_second_kernel, text_kernel
 from service.errors import AcquisitionError, BadConfiguration
 from service.features.products import attitudes
 from service.table_files.spool import folder, pieces
+from service.times import TT_LESS_TAI_S
 from service.vectors import Vector, attitude_matrices
 
 CHILD_S = 600.0
@@ -100,7 +101,6 @@ def _run_child(place: Path, file: str, instrument: int, its_clock: list[str]) ->
 
 _CLOCK_ZERO_S = -883_656_000
 """Zero of the service's own clock in TAI seconds since 2000-01-01T12:00:00."""
-_TT_LESS_TAI_S = 32.184
 
 
 def clock_ticks(tai_ns: Integers) -> Vector:
@@ -126,7 +126,7 @@ def instrument_id(about: attitudes.SeriesInfo) -> int:
 def clock_kernel(about: attitudes.SeriesInfo) -> str:
     """Text of the spacecraft's clock kernel (SCLK)."""
     id = -about.naif_id
-    zero = f"{_CLOCK_ZERO_S + _TT_LESS_TAI_S:.3f}"
+    zero = f"{_CLOCK_ZERO_S + TT_LESS_TAI_S:.3f}"
     return text_kernel(
         "SCLK",
         f"Clock of {body_name(about)}: seconds and microseconds since 1972-01-01T00:00:00 TAI.",

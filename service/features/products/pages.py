@@ -14,8 +14,13 @@ from service.features.products.part import TABLE_KINDS, Products
 from service.missions.product_settings import MAX_LARGEST_GAP_S
 from service.table_files.formats import TABLE_FORMATS
 from service.web.console.page import ContextDep, FromQuery, PageContext, console_page
-from service.web.console.pages import spacecraft
 from service.web.console.pages.period import without_gyro
+from service.web.console.pages.spacecraft_page import (
+    RANGES_S,
+    ShownPeriod,
+    SpacecraftQuery,
+    shown_period,
+)
 from service.web.requests.access import Policy
 
 GRADES: dict[ProductGrade, str] = {
@@ -31,7 +36,7 @@ FEW_PER_STRETCH = 10
 """Least mean number of attitudes per interval for a file that is useful for interpolation."""
 
 
-class FilesQuery(spacecraft.SpacecraftQuery):
+class FilesQuery(SpacecraftQuery):
     """Query of the files page: period and largest gap; empty: from the mission or the cadence."""
 
     gap_s: Annotated[float | None, Field(gt=0, le=MAX_LARGEST_GAP_S)] = None
@@ -69,7 +74,7 @@ class GradeOfFile:
 def files_page(name: str, query: FromQuery[FilesQuery], context: ContextDep) -> Response:
     """Console page with export files of a period: attitudes by grade and format, and tables."""
     context.app.context.mission(name)
-    shown = spacecraft.shown_period(context, name, query)
+    shown = shown_period(context, name, query)
 
     def address(product: str, format: str, **more: str) -> str:
         assert shown is not None
@@ -89,7 +94,7 @@ def files_page(name: str, query: FromQuery[FilesQuery], context: ContextDep) -> 
         name=name,
         query=query,
         stretch=shown,
-        ranges=list(spacecraft.RANGES_S),
+        ranges=list(RANGES_S),
         grades=_grades(context, name, query, shown) if shown else [],
         attitude_formats=attitude_formats(),
         formats=TABLE_FORMATS,
@@ -100,7 +105,7 @@ def files_page(name: str, query: FromQuery[FilesQuery], context: ContextDep) -> 
 
 
 def _grades(
-    context: PageContext, name: str, query: FilesQuery, shown: spacecraft.ShownPeriod
+    context: PageContext, name: str, query: FilesQuery, shown: ShownPeriod
 ) -> list[GradeOfFile]:
     found = []
     products = context.app.part(Products)

@@ -6,7 +6,7 @@ from service.contract.answers import Answer
 from service.features.tracks.part import Tracks
 from service.storage.queries.period import PeriodStars
 from service.web.console.page import PageContext, Panel
-from service.web.console.pages.spacecraft import ShownPeriod
+from service.web.console.pages.spacecraft_page import ShownPeriod
 
 MOST_LINKED = 600
 """Greatest number of batches in which a page searches tracks; takes about a second."""

@@ -14,7 +14,7 @@ from erfa import ufunc
 
 from service.errors import BadInput
 from service.imaging.frames.fits_header import Header
-from service.times import DAY_S, Utc, parse_utc, recorded_utc, shifted
+from service.times import DAY_S, TT_LESS_TAI_S, Utc, parse_utc, recorded_utc, shifted
 
 EXPOSURES = ("XPOSURE", "EXPTIME", "EXPOSURE")
 AVERAGES, STARTS, ENDS = (
@@ -48,10 +48,10 @@ _UNITS_S = {
 _LESS_TAI_S = {
     "TAI": 0.0,
     "IAT": 0.0,
-    "TT": 32.184,
-    "TDT": 32.184,
-    "ET": 32.184,
-    "TDB": 32.184,
+    "TT": TT_LESS_TAI_S,
+    "TDT": TT_LESS_TAI_S,
+    "ET": TT_LESS_TAI_S,
+    "TDB": TT_LESS_TAI_S,
     "GPS": -19.0,
 }
 """Seconds by which each time scale is ahead of TAI; TDB is taken for TT, at most 2 ms away."""

@@ -3,7 +3,7 @@
 from starlette.requests import Request
 from starlette.responses import Response
 
-from service.app.spacecraft import batch_table, history_table
+from service.app.fleet import batch_table, history_table
 from service.contract import spacecraft as models
 from service.contract.answers import Result
 from service.contract.events import RecordHead

@@ -13,7 +13,6 @@ import pandas as pd
 import pyarrow.parquet
 import pytest
 
-from service.app import spacecraft
 from service.errors import NotAvailable
 from service.features.products import result_tables
 from service.features.products.attitude_formats import attitude_formats
@@ -119,7 +118,7 @@ def test_fits_has_units_that_astropy_knows(tmp_path):
     """Those of every table: a warning is an error here."""
     quantities = [Column(name, unit=each.unit) for name, each in QUANTITIES.items()]
     of_tables = [*COLUMNS, *ESTIMATED_COLUMNS, *quantities]
-    for module in (spacecraft, result_tables, gyro):
+    for module in (fleet, result_tables, gyro):
         for each in vars(module).values():
             if isinstance(each, tuple) and each and isinstance(each[0], Column):
                 of_tables += each

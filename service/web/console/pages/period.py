@@ -15,7 +15,7 @@ from service.web.console.charts.histogram import (
     residual_histogram,
 )
 from service.web.console.page import ContextDep, FromQuery, PageContext, console_page
-from service.web.console.pages.spacecraft import (
+from service.web.console.pages.spacecraft_page import (
     RANGES_S,
     ShownPeriod,
     SpacecraftQuery,
