@@ -25,7 +25,8 @@ class PicturesMethods:
 
         - `picture`: The content of the file.
         - `spacecraft`: Whose camera took it. Default: a camera that the service does not know.
-        - `field_of_view_deg`: Along the longer side; may be wrong by a quarter.
+        - `field_of_view_deg`: Along the longer side; may be wrong by a quarter. From 120: with
+          `lens`.
         - `lens`: How the lens projects the sky. Default: whatever fits.
         - `image`: As of a frame.
         - `overlay`: Whether the answer holds the picture with the stars.

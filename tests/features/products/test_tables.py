@@ -13,6 +13,7 @@ import pandas as pd
 import pyarrow.parquet
 import pytest
 
+from service.app import fleet
 from service.errors import NotAvailable
 from service.features.products import result_tables
 from service.features.products.attitude_formats import attitude_formats
