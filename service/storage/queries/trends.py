@@ -450,7 +450,7 @@ def _shown(
 def latest_samples(
     connection: Connection, selected: ResultFilter, subject: Subject, limit: int
 ) -> tuple[list[int], list[Sample]]:
-    """Times in TAI ns of the latest batches, and their samples of a subject, oldest first."""
+    """Times (ns of TAI) of the latest batches, and the samples of those with a value, in order."""
     _, tracker = quantity_and_tracker(subject)
     values = tracker_values if tracker else results
     columns = [values.c[name] for name in (*tables.COUNTED, "status", *tables.MEASURED)]
