@@ -14,7 +14,6 @@ from service.mission_checks.mission_check import (
     FEW_STARS,
     Finding,
     TrackerView,
-    axis_findings,
     findings,
     tracker_views,
 )
@@ -49,11 +48,9 @@ def examined(mission: "Mission", catalog: "Catalog", epoch: float | None) -> Mis
     """Check a mission with the run catalog of an epoch in years, by default the present year."""
     year = mission.catalog.epoch_of(epoch_of(epoch))
     run_catalog = build_run_catalog(catalog, mission.run_catalog_settings, year)
-    wrong = [each for each in axis_findings(mission) if each.level == "wrong"]
-    if wrong or len(run_catalog) == 0:
+    if len(run_catalog) == 0:
         empty = Finding("wrong", "catalog", "leaves no star in the run catalog")
-        found = wrong or [empty]
-        return MissionReport(mission, run_catalog, [], [], found)
+        return MissionReport(mission, run_catalog, [], [], [empty])
     views, zones = tracker_views(mission, run_catalog), zone_censuses(mission, run_catalog)
     faintest_mag = float(np.percentile(catalog.magnitude_v_mag, FAINTEST_SHARE))
     found = findings(mission, faintest_mag, views, zones)

@@ -75,15 +75,6 @@ def _round_field_deg(tracker: Tracker) -> float:
     return math.degrees(math.acos(1.0 - area_sr / math.tau))
 
 
-def axis_findings(mission: Mission) -> list[Finding]:
-    """Findings on the axis of a zone whose vector is not of length one."""
-    length = math.hypot(*mission.zone.axis_body)
-    if abs(length - 1.0) > 1e-3:
-        text = f"has the length {length:g}; it is used as a direction, so check its components"
-        return [Finding("unusual", "zone.axis_body", text)]
-    return []
-
-
 def findings(
     mission: Mission,
     faintest_mag: float,
@@ -95,7 +86,6 @@ def findings(
     `faintest_mag` is the magnitude of the star catalog's faintest stars.
     """
     found = [
-        *axis_findings(mission),
         *_zone(mission),
         *_tolerances(mission),
         *_trackers(mission),
@@ -106,6 +96,10 @@ def findings(
 
 def _zone(mission: Mission) -> Iterator[Finding]:
     zone = mission.zone
+    length = math.hypot(*zone.axis_body)
+    if abs(length - 1.0) > 1e-3:
+        text = f"has the length {length:g}; it is used as a direction, so check its components"
+        yield Finding("unusual", "zone.axis_body", text)
     widest_deg = max(each.field_of_view_radius_deg for each in mission.trackers)
     if not isinstance(zone, Band):
         if zone.radius_deg <= widest_deg:

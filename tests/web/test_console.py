@@ -15,6 +15,7 @@ from service.missions.mission import load_missions
 from service.observations.schema import submission_from_json
 from service.simulate.stretches import NO_TROUBLES, Pass
 from service.simulate.telemetry import draw_pass
+from service.storage.queries.star_field import Boresight, TrackerField
 from service.vectors import angle_between_deg, matrix_from_quaternion
 from service.web.app import create_app
 from service.web.console import formatting, options
@@ -386,6 +387,24 @@ def test_brighter_stars_are_larger_and_the_faintest_are_still_seen():
     sizes = [sky_chart.star_radius(magnitude, 6.5) for magnitude in np.linspace(-1, 7, 50)]
     assert all(a >= b for a, b in itertools.pairwise(sizes))
     assert sizes[-1] >= 1.0
+
+
+@pytest.mark.parametrize("radius_deg", [0.1, 1.0, 8.0, 39.9, 40.1, 67.2, 80.0])
+def test_a_star_chart_of_any_size_has_one_to_four_rings(radius_deg):
+    chart = sky_chart.sky_chart(
+        TrackerField(
+            tracker="wide",
+            boresight=Boresight(ra_deg=0.0, dec_deg=0.0),
+            field_of_view_radius_deg=radius_deg / 1.25,
+            radius_deg=radius_deg,
+            magnitude_limit_mag=6.0,
+            zone_edges=[],
+            catalog=[],
+            observed=[],
+        ),
+        "quest",
+    )
+    assert len(chart.rings) in ((0, 1, 2, 3, 4) if radius_deg < 0.25 else (1, 2, 3, 4))
 
 
 def points_of(path):

@@ -383,7 +383,8 @@ def _arrow_scale(lengths_arcsec: Sequence[float]) -> tuple[float, float | None]:
 
 def _rings(radius_deg: float, field_deg: float) -> list[float]:
     """Up to four round radii within the picture, apart from the edge of the field of view."""
-    step = next(s for s in (0.25, 0.5, 1.0, 2.0, 5.0, 10.0) if radius_deg / s <= 4.0)
+    steps = (0.25, 0.5, 1.0, 2.0, 5.0, 10.0)
+    step = next((each for each in steps if radius_deg / each <= 4.0), 20.0)
     count = int(radius_deg / step)
     return [step * k for k in range(1, count + 1) if abs(step * k - field_deg) > step / 4]
 
