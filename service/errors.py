@@ -51,10 +51,10 @@ def printable(text: str) -> str:
     )
 
 
-def shown_value(value: object, limit: int = 80) -> str:
-    """Format a value for a message, cut to `limit` characters."""
+def shown_value(value: object) -> str:
+    """Format a value for a message, cut to 80 characters."""
     text = repr(value)
-    return text if len(text) <= limit else text[: limit - 1] + "…"
+    return text if len(text) <= 80 else text[:79] + "…"
 
 
 class AcquisitionError(Exception):

@@ -61,11 +61,11 @@ def configured() -> LogSettings | None:
     return _configured
 
 
-def configure(settings: LogSettings, process: str, stream: TextIO | None = None) -> None:
-    """Configure logging to a stream (standard error); each line names `process`."""
+def configure(settings: LogSettings, process: str) -> None:
+    """Configure logging to standard error; each line names `process`."""
     global _configured
     _configured = settings
-    handler = CountingHandler(stream)
+    handler = CountingHandler()
     handler.setFormatter(JsonLines(process) if settings.format == "json" else TextLines(process))
     level = logging.getLevelNamesMapping()[settings.level.upper()]
     # Libraries log much at lower levels: keep only their warnings and errors.

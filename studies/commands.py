@@ -9,10 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from service.cli.arguments import (
-    STANDARD_OUTPUT,
     add_command,
     add_json,
-    add_json_file,
     commands_of,
     count,
     mission_of_file_or_name,
@@ -26,6 +24,7 @@ VOTES = "starid"
 TESTS_USUALLY_ON = ("magnitude", "cross_product", "pole")
 TESTS_USUALLY_OFF = ("fov_rotation", "match_groups")
 DEFAULT_STARS = 10_000
+STANDARD_OUTPUT = Path("-")
 NOTES = """\
 names of a sweep, with the paper's where it has one:
   tolerances of the mission file: pair_separation_max_deg (HMAX), separation_deg (SEPTOL),
@@ -47,6 +46,18 @@ def add(commands: Any) -> None:
     _add_imaging(group)
     _add_mission(group)
     _add_paper(group)
+
+
+def _add_json_file(parser: ArgumentParser, what: str) -> None:
+    """Add the option `--json [OUT]`, which writes `what` as JSON to a file or prints it."""
+    parser.add_argument(
+        "--json",
+        type=Path,
+        nargs="?",
+        const=STANDARD_OUTPUT,
+        metavar="OUT",
+        help=f"write {what} to OUT; without OUT, print them instead of the tables",
+    )
 
 
 def _add_mission(group: Any) -> None:
@@ -288,7 +299,7 @@ def _add_paper(group: Any) -> None:
         help="named tables: fields per condition; default 10000",
     )
     parser.add_argument("--seed", type=int, nargs="+", metavar="S", help="default 1")
-    add_json_file(parser, "the rates, one row per run,")
+    _add_json_file(parser, "the rates, one row per run,")
     parser.add_argument("--plots", type=Path, metavar="FOLDER", help="write the figures")
     parser.add_argument(
         "--report",
@@ -392,7 +403,7 @@ def _add_imaging(group: Any) -> None:
     )
     parser.add_argument("--seed", type=int, default=1, metavar="S", help="default 1")
     parser.add_argument("--quick", action="store_true", help="small samples and coarser grids")
-    add_json_file(parser, "the claims with their figures")
+    _add_json_file(parser, "the claims with their figures")
     parser.add_argument(
         "--plots", type=Path, metavar="FOLDER", help="write the figures (needs matplotlib)"
     )

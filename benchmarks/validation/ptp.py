@@ -13,7 +13,6 @@ from benchmarks.sections import Section, Written
 from service.identify.triangles.ptp import identify_triangles, propose
 from service.identify.triangles.triangle_match import projection_sigma
 from service.missions.mission import RunCatalogSettings
-from service.simulate.scenes import Conditions, Scene, SceneSky, draw_random_points, draw_scenes
 from service.sky.catalog.run_catalog import build_run_catalog
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.geometry.kvector import bracket
@@ -21,6 +20,7 @@ from service.sky.geometry.triangles import REACH_DEG, build_triangles, project
 from service.sky.whole_sky.guide import Guide, build_guide
 from service.vectors import unit
 from studies.ptp_2015.printed import the_ptp_paper
+from studies.scenes import Conditions, Scene, SceneSky, draw_random_points, draw_scenes
 
 FIELDS, QUICK_FIELDS = 10_000, 200
 DRAWS = 20_000

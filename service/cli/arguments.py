@@ -275,21 +275,6 @@ def add_output(parser: argparse.ArgumentParser) -> None:
     )
 
 
-STANDARD_OUTPUT = Path("-")
-
-
-def add_json_file(parser: argparse.ArgumentParser, what: str) -> None:
-    """Add the option `--json [OUT]`, which writes `what` as JSON to a file or prints it."""
-    parser.add_argument(
-        "--json",
-        type=Path,
-        nargs="?",
-        const=STANDARD_OUTPUT,
-        metavar="OUT",
-        help=f"write {what} to OUT; without OUT, print them instead of the tables",
-    )
-
-
 def add_period(parser: argparse.ArgumentParser, run_help: str) -> None:
     """Add the options `--run`, `--start` and `--end`; see `period_of`."""
     parser.add_argument("--run", metavar="NAME", help=run_help)

@@ -26,7 +26,6 @@ SOURCES = (
     "service/observations/columns.py",
     "service/observations/focal_plane.py",
     "service/observations/scans",
-    "service/simulate/scenes.py",
     "service/sky",
     "service/csv_cells.py",
     "service/errors.py",
@@ -35,6 +34,7 @@ SOURCES = (
     "service/times.py",
     "service/vectors.py",
     "studies/ptp_2015/rivals",
+    "studies/scenes.py",
 )
 """Patterns of all source files with compiled code, and of the files that they import."""
 

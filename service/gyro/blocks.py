@@ -189,16 +189,19 @@ class GyroLineIn(GyroBlockIn):
     spacecraft: Key
 
 
-def block_from_json(body: bytes | str, spacecraft: str, run: str | None = None) -> GyroBlock:
-    """A gyro block from a JSON body; `run` overrides the block's own.
+def block_from_json(body: bytes | str, spacecraft: str) -> GyroBlock:
+    """A gyro block from a JSON body.
 
     Raises `BadBatch` with the faults, each naming field and value.
     """
-    return block_from_model(checked_by(GyroBlockIn.model_validate_json, body), spacecraft, run)
+    return block_from_model(checked_by(GyroBlockIn.model_validate_json, body), spacecraft)
 
 
 def block_from_line(line: bytes | str, run: str | None = None) -> GyroBlock:
-    """A gyro block from a line of a telemetry file; see `block_from_json`."""
+    """A gyro block from a line of a telemetry file; `run` overrides the block's own.
+
+    Raises as `block_from_json` does.
+    """
     model = checked_by(GyroLineIn.model_validate_json, line)
     return block_from_model(model, model.spacecraft, run)
 

@@ -222,15 +222,6 @@ def _polar_angles(direction, axis, brighter, dimmer, polar, difference):  # type
         difference[k] = polar[brighter[k]] - polar[dimmer[k]]
 
 
-def counts_within(zone: Zone, region: SearchRegion) -> tuple[int, int]:
-    """The numbers of a zone's stars and pairs within a region that it serves."""
-    one, found = np.zeros(1, np.int64), np.empty((1, 2), np.int64)
-    least, most = math.radians(region.least_deg), math.radians(region.most_deg)
-    count_within(zone, one, np.array((region.axis,)), np.array((least,)), np.array((most,)), found)
-    stars, pairs = found[0].tolist()
-    return stars, pairs
-
-
 def count_within(
     zone: Zone,
     which: npt.NDArray[np.int64],

@@ -18,7 +18,6 @@ import numpy.typing as npt
 from tqdm import tqdm
 
 from service.identify.triangles.ptp import explained
-from service.simulate.scenes import Conditions, Scene, SceneSky, draw_scenes
 from service.sky.geometry.triangles import REACH_DEG
 from service.sky.whole_sky.guide import Guide, build_guide
 from studies.ptp_2015.projections import Projections, projections_of
@@ -27,6 +26,7 @@ from studies.ptp_2015.rivals.planar_triangle import build_planar_triangle
 from studies.ptp_2015.rivals.projected_triangles import build_p_vector, build_ptp
 from studies.ptp_2015.rivals.proposed import Algorithm, Build
 from studies.ptp_2015.rivals.pyramid import build_pyramid
+from studies.scenes import Conditions, Scene, SceneSky, draw_scenes
 from studies.workers import mapping
 
 COLUMNS = ("stars", "named", "named_right", "unique", "unique_right", "own_us", "check_us")

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from service.imaging.centroids.sequential import StateEstimate, batch, diffuse, least_norm
+from service.imaging.centroids.sequential import StateEstimate, batch, diffuse
 from service.imaging.centroids.window import Array
 from studies.star_image_report import measurements
 from studies.star_image_report.claims import Claim, Picture, Row, Study
@@ -25,6 +25,16 @@ def gaussian(u: Array, v: Array) -> Array:
 def gaussian_slopes(u: Array, v: Array) -> tuple[Array, Array]:
     """Derivatives of a Gaussian image with respect to u and v."""
     return -u * gaussian(u, v), -v * gaussian(u, v)
+
+
+def least_norm(rows: Array, values: Array, norm: Array) -> Array:
+    """The state of least A^T Q A that exactly fits fewer measurements than unknowns (6.11).
+
+    Computed as Q^-1 C^T (C Q^-1 C^T)^-1 R, the result of the recursion that starts at zero with the
+    covariance Q^-1 and takes measurements without noise.
+    """
+    spread = np.linalg.solve(norm, rows.T)
+    return np.asarray(spread @ np.linalg.solve(rows @ spread, values))
 
 
 def sequential(study: Study) -> Row:

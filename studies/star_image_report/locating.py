@@ -8,13 +8,14 @@ import numpy as np
 from service.imaging.centroids.psf import GaussianPsf, airy_psf, wired_psf
 from service.imaging.centroids.window import Array
 from service.imaging.detection.star_images import AIRY_OVER_SIGMA
-from service.imaging.optics import behind_wires, disc, image_by_fft
+from service.imaging.optics import behind_wires, disc
 from service.vectors import ARCSEC_PER_RADIAN
 from studies.star_image_report import correlate, sun_tracker
 from studies.star_image_report.claims import Claim, Picture, Row, Study
 from studies.star_image_report.mesh import THICK_M, THIN_M
 from studies.star_image_report.optics import DIAMETER_M, LASER_M
 from studies.star_image_report.sun_tracker import SunTracker
+from studies.star_image_report.transfer import image_by_fft
 from studies.star_image_report.wires import filtered
 
 GRID = np.arange(-60.0, 61.0)

@@ -5,17 +5,11 @@ from typing import Any
 import numpy as np
 
 from service.imaging.centroids.window import Array
-from service.imaging.optics import (
-    Pupil,
-    between_wires,
-    centres,
-    image_at,
-    image_by_fft,
-    thermal,
-)
+from service.imaging.optics import Pupil, centres, image_at, thermal
 from studies.star_image_report import wires_and_lines
 from studies.star_image_report.claims import Claim, Picture, Row, Study
 from studies.star_image_report.optics import DIAMETER_M, LASER_M
+from studies.star_image_report.transfer import between_wires, image_by_fft
 from studies.star_image_report.wires import (
     INCH_M,
     Mesh,

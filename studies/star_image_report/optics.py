@@ -8,15 +8,15 @@ import numpy.typing as npt
 from scipy.special import j1, jn_zeros
 
 from service.imaging.centroids.window import Array
-from service.imaging.optics import (
-    LIGHT_SPEED_M_PER_S,
+from service.imaging.optics import LIGHT_SPEED_M_PER_S, disc
+from studies.star_image_report.claims import Claim, Picture, Row, Study
+from studies.star_image_report.transfer import (
     autocorrelation,
-    disc,
+    behind_plate,
     gaussian_line,
     image_by_fft,
     image_by_functional,
 )
-from studies.star_image_report.claims import Claim, Picture, Row, Study
 from studies.star_image_report.wires import INCH_M
 
 DIAMETER_M = 0.542 * INCH_M
@@ -84,7 +84,7 @@ def _wedge(cells: int = 64, moved: int = 3, index: float = 1.5) -> tuple[int, fl
     angle = moved * LASER_M / DIAMETER_M
     glass = np.broadcast_to(pupil.places_m * angle / (index - 1.0), (cells, cells))
     straight = image_by_fft(pupil, LASER_M).intensity
-    through = image_by_fft(pupil.with_plate(glass, index, LASER_M), LASER_M).intensity
+    through = image_by_fft(behind_plate(pupil, glass, index, LASER_M), LASER_M).intensity
     # One sample of the transform is lambda / D here.
     off = np.abs(np.roll(straight, moved, axis=1) - through).max() / straight.max()
     return moved, float(off)

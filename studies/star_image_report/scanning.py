@@ -9,14 +9,29 @@ import numpy.typing as npt
 
 from service.errors import BadInput, Fault
 from service.imaging.centroids.window import Array
-from service.imaging.optics import disc, image_by_fft
-from service.observations.scans.lines import ProfileMoment, cross_scan, mean_of_scans, moment
+from service.imaging.optics import disc
+from service.observations.scans.lines import ProfileMoment, ScanResult, cross_scan, moment
 from studies.star_image_report.claims import Claim, Picture, Row, Study
 from studies.star_image_report.optics import DIAMETER_M, LASER_M
+from studies.star_image_report.transfer import image_by_fft, is_even
 
 SIGMA = 0.02
 CASES = ((6, 0.0), (6, 1.0), (6, 3.0), (12, 0.0), (24, 0.0))
 SINC_WIDTH = 1.82
+
+
+def mean_of_scans(scans: npt.ArrayLike, spacing: float, noise_sigma: float) -> ScanResult:
+    """The mean displacement of M scans (M, samples) of one place, with 1/M of the variance.
+
+    Each scan must hold enough light by itself, as in the report; otherwise add the samples first.
+    """
+    each = [cross_scan(scan, spacing, noise_sigma) for scan in np.atleast_2d(scans)]
+    m = len(each)
+    return ScanResult(
+        float(np.mean([one.displacement for one in each])),
+        math.sqrt(sum(one.sigma**2 for one in each)) / m,
+        float(min(one.signal_ratio for one in each)),
+    )
 
 
 def _gaussian(v: Array, d: float = 0.0) -> Array:
@@ -68,7 +83,7 @@ def centroid(study: Study) -> Row:
                 "an aperture even in x and y makes an even image",
                 f"a ring's image and its mirror are apart by {uneven:.0e} of the peak",
                 "confirmed",
-                pupil.is_even() and uneven < 1e-12,
+                is_even(pupil) and uneven < 1e-12,
                 {"apart": uneven},
             ),
             Claim(

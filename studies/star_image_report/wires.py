@@ -12,7 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from service.imaging.centroids.window import Array
-from service.imaging.optics import Pupil, between_wires, disc, image_at, image_by_fft
+from service.imaging.optics import Pupil, disc, image_at
+from studies.star_image_report.transfer import between_wires, image_by_fft
 
 INCH_M = 0.0254
 Wires = Sequence[tuple[float, float]]

@@ -12,6 +12,7 @@ from service.imaging.centroids.window import Array
 from service.imaging.optics import LIGHT_SPEED_M_PER_S, Spectrum
 from studies.star_image_report.claims import Claim, Picture, Study
 from studies.star_image_report.optics import DIAMETER_M, LASER_M
+from studies.star_image_report.transfer import mean_wavelength_m
 from studies.star_image_report.wires import INCH_M, Mesh, Wires, filtered, tail
 
 THIN_M, THICK_M = 0.00443 * INCH_M, 0.00663 * INCH_M
@@ -95,7 +96,7 @@ def in_light(spectrum: Spectrum, wire_list: Wires, p_rad: Array, fringe: int = 5
 
 def depth_of_null(spectrum: Spectrum, wire_m: float) -> float:
     """Darkest intensity in a wire's tail, relative to the following lobe."""
-    middle = spectrum.mean_wavelength_m / wire_m
+    middle = mean_wavelength_m(spectrum) / wire_m
     p = np.linspace(0.6, 1.9, 131) * middle
     light = in_light(spectrum, [(0.0, wire_m)], p)
     at = int(np.argmin(light[:80]))
@@ -105,7 +106,7 @@ def depth_of_null(spectrum: Spectrum, wire_m: float) -> float:
 def contrast_of_orders(spectrum: Spectrum) -> float:
     """Contrast of a mesh's orders in the second dash of its tail, in all wavelengths."""
     across = MESH.across(DIAMETER_M)
-    p = np.linspace(6.6, 7.6, 61) * spectrum.mean_wavelength_m / MESH.pitch_m
+    p = np.linspace(6.6, 7.6, 61) * mean_wavelength_m(spectrum) / MESH.pitch_m
     share = spectrum.power / spectrum.power.sum()
     light = sum(
         float(part) * tail_of_wires(across, float(wavelength), p)

@@ -17,7 +17,11 @@ from service.identify.lost_in_space.finder import magnitude_offset, search_sky
 from service.identify.lost_in_space.matching import nearest_stars
 from service.identify.lost_in_space.solver import FieldOfView, LostInSpace, _solve
 from service.missions.mission import RunCatalogSettings
-from service.simulate.scenes import (
+from service.sky.catalog.run_catalog import build_run_catalog
+from service.sky.catalog.star_catalog import load_embedded
+from service.sky.whole_sky.index import build_sky_index
+from service.vectors import locked, unit
+from studies.scenes import (
     Conditions,
     PinholeCamera,
     Scene,
@@ -25,10 +29,6 @@ from service.simulate.scenes import (
     draw_random_points,
     draw_scenes,
 )
-from service.sky.catalog.run_catalog import build_run_catalog
-from service.sky.catalog.star_catalog import load_embedded
-from service.sky.whole_sky.index import build_sky_index
-from service.vectors import locked, unit
 from tests.chance import at_least, at_most
 from tests.scale import draws, some_in_a_sitting
 

@@ -12,8 +12,8 @@ from service.identify.lost_in_space.pair_order import rows_of_magnitude
 from service.identify.lost_in_space.prefilter import pairs_of
 from service.identify.lost_in_space.solver import FieldOfView, LostInSpace
 from service.identify.lost_in_space.workspace import CHUNK, Chunk
-from service.simulate.scenes import Conditions, SceneSky, draw_random_points, draw_scenes
 from service.sky.whole_sky.index import build_sky_index
+from studies.scenes import Conditions, SceneSky, draw_random_points, draw_scenes
 
 
 @pytest.fixture(scope="module")

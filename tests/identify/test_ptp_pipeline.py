@@ -13,9 +13,9 @@ from service.imaging.frames.files import read_frame
 from service.imaging.frames.frame import FrameLimits
 from service.missions.mission import Mission, parse_mission
 from service.observations.schema import submission_from_json
-from service.simulate.scenes import Conditions, SceneSky, draw_scenes
 from service.sky.whole_sky.guide import GuideKey
 from service.vectors import attitude_error_arcsec, matrix_from_quaternion, quaternion_from_matrix
+from studies.scenes import Conditions, SceneSky, draw_scenes
 
 CAMERA = """
 name = "CAMERA"

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from service.imaging.centroids.sequential import batch, diffuse, least_norm
+from service.imaging.centroids.sequential import batch, diffuse
+from studies.star_image_report.estimating import least_norm
 from studies.star_image_report.measurements import Hump, StopRule, hump_of, recentred
 
 ROUND = Hump(peak=1.0, M=-1.0, L=-1.3, J=0.2)

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.sky.cache import LruCache
-from service.sky.zones import SearchRegion, build_zone, counts_within, snapped, zone_for
+from service.sky.zones import SearchRegion, build_zone, count_within, snapped, zone_for
 from service.vectors import angle_between_deg, from_ra_dec, unit
 from tests.reference.small_sky import run_catalog
 
@@ -32,6 +32,14 @@ def within(catalog, axis, least_deg, most_deg):
         if least_deg <= angle <= most_deg:
             rows.append(row)
     return rows
+
+
+def counts_within(zone, region):
+    """The numbers of a zone's stars and pairs within a region."""
+    found = np.empty((1, 2), np.int64)
+    bounds = np.array([[math.radians(region.least_deg)], [math.radians(region.most_deg)]])
+    count_within(zone, np.zeros(1, np.int64), np.array([region.axis]), *bounds, found)
+    return tuple(found[0].tolist())
 
 
 aims = st.one_of(

@@ -3,10 +3,10 @@
 import pytest
 
 from service.app.factory import open_app
+from service.missions.motion import GyroSettings
 from service.settings import Settings
 from service.storage.recording.signing import PublicKey, make_key
 from service.storage.upkeep.verify import verify
-from tests.features.definitive.passes import GYRO, mission_with
 from tests.storage import samples, sealed
 
 
@@ -56,7 +56,9 @@ def key(tmp_path):
 @pytest.fixture
 def signed(opened, make, key, missions):
     """Fills the test's database with results and rows of every kind, all in signed heads."""
-    app = opened(mission_with(missions["XTE"], gyro=GYRO), record_key=str(key[0]))
+    gyro = GyroSettings(sigma_v_rad_s0_5=3e-7, sigma_u_rad_s1_5=3e-10)
+    mission = missions["XTE"].model_copy(update={"gyro": gyro})
+    app = opened(mission, record_key=str(key[0]))
     sealed.fill(app, make, missions)
     app.close()
     return app

@@ -19,16 +19,6 @@ from service.identify.lost_in_space.solver import FieldOfView
 from service.missions.mission import Mission
 from service.observations.batch import ObservationBatch, Options, QuaternionPrior, TrackerStars
 from service.simulate.motion import random_axis
-from service.simulate.scenes import (
-    EPOCH_YEAR,
-    MERGE_WITHIN_ARCSEC,
-    Conditions,
-    PinholeCamera,
-    Scene,
-    SceneSky,
-    draw_random_points,
-    draw_scenes,
-)
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
@@ -40,6 +30,16 @@ from service.vectors import (
     matrix_from_quaternion,
     quaternion_from_matrix,
     rotate_about,
+)
+from studies.scenes import (
+    EPOCH_YEAR,
+    MERGE_WITHIN_ARCSEC,
+    Conditions,
+    PinholeCamera,
+    Scene,
+    SceneSky,
+    draw_random_points,
+    draw_scenes,
 )
 
 QUICK_SHARE = 0.05

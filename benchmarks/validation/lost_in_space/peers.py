@@ -20,10 +20,10 @@ import numpy as np
 
 from service.identify.lost_in_space.finder import search_sky
 from service.identify.lost_in_space.solver import FieldOfView, LostInSpace
-from service.simulate.scenes import PinholeCamera, Scene
 from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.whole_sky.index import build_sky_index
 from service.vectors import Matrix, from_ra_dec
+from studies.scenes import PinholeCamera, Scene
 
 LIMIT_MAG = 6.5
 PATTERN_ERROR = 0.005

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from benchmarks.validation.lost_in_space.peers import LIMIT_MAG, Solver
-from service.simulate.scenes import Scene
 from service.vectors import Matrix
+from studies.scenes import Scene
 
 RIGHT_BORESIGHT_DEG, RIGHT_ROTATION_DEG = 0.1, 1.0
 SIX = 6

@@ -206,9 +206,9 @@ def _confidence(verdict: ToleranceVerdict, needed: Interval | None) -> Confidenc
     return "high" if width <= 0.15 else "moderate" if width <= 0.4 else "low"
 
 
-def rounded_up(value: float, digits: int = 2) -> float:
+def rounded_up(value: float) -> float:
     """Round a value up to two significant digits, for a mission file."""
     if value <= 0.0:
         return 0.0
-    step = 10.0 ** (math.floor(math.log10(value)) - digits + 1)
+    step = 10.0 ** (math.floor(math.log10(value)) - 1)
     return float(f"{math.ceil(round(value / step, 9)) * step:.12g}")

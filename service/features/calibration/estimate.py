@@ -331,7 +331,7 @@ class HeldOut:
 
 
 def calibrate_with_chosen_degree(
-    stars: IdentifiedStars, model: Model, blocks: int = BLOCKS
+    stars: IdentifiedStars, model: Model
 ) -> tuple[Calibration, tuple[HeldOut, ...]]:
     """Calibrate with the best distortion degree up to the model's; also return the error of each
     degree.
@@ -339,20 +339,18 @@ def calibrate_with_chosen_degree(
     Raises `BadInput` if there are too few stars for the model's own degree.
     """
     usable = stars.usable(model.attitudes_known)
-    tried = held_out(usable, model, fit(usable, model), blocks)
+    tried = held_out(usable, model, fit(usable, model))
     (chosen,) = (each.degree for each in tried if each.chosen)
     return calibrate(usable, replace(model, degree=chosen)), tried
 
 
-def held_out(
-    stars: IdentifiedStars, model: Model, settled: Fit, blocks: int = BLOCKS
-) -> tuple[HeldOut, ...]:
+def held_out(stars: IdentifiedStars, model: Model, settled: Fit) -> tuple[HeldOut, ...]:
     """Cross-validate every distortion degree up to the model's by held-out blocks of batches.
 
     The settled fit is linear near its solution: leaving out a block subtracts its normal equations.
     Stars left out by the fit stay left out.
     """
-    edges = _edges(stars.batches, blocks)
+    edges = _edges(stars.batches)
     derivatives = [
         linearise.linearised(part, settled.values, settled.attitude) for part in settled.parts
     ]
@@ -375,8 +373,8 @@ def held_out(
     )
 
 
-def _edges(batches: int, blocks: int) -> Indices:
-    count = min(blocks, batches)
+def _edges(batches: int) -> Indices:
+    count = min(BLOCKS, batches)
     return np.unique(np.linspace(0, batches, count + 1).astype(np.int64))
 
 

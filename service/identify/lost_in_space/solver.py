@@ -63,13 +63,11 @@ class FieldOfView:
     magnitude_sigma_mag: float = 0.5
 
     @classmethod
-    def square(
-        cls, side_deg: float, limit_mag: float = math.nan, magnitude_sigma_mag: float = 0.5
-    ) -> "FieldOfView":
+    def square(cls, side_deg: float) -> "FieldOfView":
         """A square field of view with edges `side_deg` apart."""
         tangent = math.tan(math.radians(0.5 * side_deg))
         corner_deg = math.degrees(math.atan(tangent * math.sqrt(2.0)))
-        return cls(corner_deg, 0.5 * side_deg, limit_mag, magnitude_sigma_mag)
+        return cls(corner_deg, 0.5 * side_deg)
 
     def as_field(self) -> FieldBounds:
         """The field of view in the form that kernels take."""

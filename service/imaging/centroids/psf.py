@@ -1,4 +1,7 @@
-"""Point spread functions integrated over pixels: a Gaussian, or a sampled image."""
+"""Point spread functions integrated over pixels: a Gaussian, or a sampled image.
+
+scipy is imported by the functions that need it: most processes never evaluate one.
+"""
 
 import math
 from collections.abc import Sequence
@@ -8,12 +11,9 @@ from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
-from scipy.interpolate import RectBivariateSpline
-from scipy.ndimage import gaussian_filter
-from scipy.special import j1
 
 from service.errors import BadInput, Fault
-from service.imaging.optics import behind_wires, disc, image_of, monochromatic
+from service.imaging.optics import behind_wires, disc, image_at
 
 LEAST_SAMPLES_PER_PX = 3
 
@@ -65,7 +65,6 @@ class GaussianPsf:
         return self._share_slope(du_px) * in_v, in_u * self._share_slope(dv_px)
 
     def _share(self, distance_px: npt.ArrayLike) -> Array:
-        # Imported at the first frame: no other request needs scipy.special.
         from scipy.special import erf
 
         x = np.asarray(distance_px, dtype=np.float64)
@@ -125,6 +124,9 @@ class SampledPsf:
 
     @cached_property
     def _spline(self) -> Any:
+        from scipy.interpolate import RectBivariateSpline
+        from scipy.ndimage import gaussian_filter
+
         rows, columns = self.image.shape
         fine = self.image / (self.image.sum() if self.total is None else self.total)
         if self.jitter_px > 0.0:
@@ -177,6 +179,8 @@ def psfs_in_colours(shortest: SampledPsf, longer: Array, weights: Array) -> list
     An aperture's image grows with the wavelength: those of the colours, `longer` (n,) times as long
     as the shortest, are summed with the `weights` (m, n), which are shares of photons, to m images.
     """
+    from scipy.interpolate import RectBivariateSpline
+
     rows, columns = shortest.image.shape
     v = np.arange(-(rows // 2), rows // 2 + 1, dtype=np.float64)
     u = np.arange(-(columns // 2), columns // 2 + 1, dtype=np.float64)
@@ -229,6 +233,8 @@ def airy_psf(
     `lambda_over_d_px` is lambda f / D in pixels; `obscuration` the dark share of the
     diameter.  [A(q) - e² A(e q)]² / (1 - e²)² with A(q) = 2 J1(q) / q.
     """
+    from scipy.special import j1
+
     if not 0.0 <= obscuration < 1.0:
         raise BadInput(Fault("obscuration", "must be from 0 to below 1", str(obscuration)))
     if not lambda_over_d_px > 0.0:
@@ -263,6 +269,8 @@ def wired_psf(
     pupil = behind_wires(clear, [(math.radians(d), offset, width) for d, offset, width in wires])
     samples = max(LEAST_SAMPLES_PER_PX + 1, math.ceil(6.0 / lambda_over_d_px))
     # With a diameter of one metre, a wavelength of one metre is an angle of one radian.
-    light = monochromatic(1.0)
-    image = image_of(pupil, light, 1.0 / (lambda_over_d_px * samples), reach_px * samples)
-    return SampledPsf(image.intensity, samples, pupil.open_area_m2 / image.step_rad**2)
+    step_rad = 1.0 / (lambda_over_d_px * samples)
+    reach = reach_px * samples
+    angle = np.arange(-reach, reach + 1, dtype=np.float64) * step_rad
+    intensity = image_at(pupil, 1.0, angle, angle)
+    return SampledPsf(intensity, samples, pupil.open_area_m2 / step_rad**2)

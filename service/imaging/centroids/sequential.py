@@ -72,13 +72,3 @@ def batch(rows: Array, values: Array, variances: npt.ArrayLike) -> StateEstimate
         )
     covariance = np.linalg.inv(weighted.T @ weighted)
     return StateEstimate(covariance @ weighted.T @ (values * root), covariance, len(values))
-
-
-def least_norm(rows: Array, values: Array, norm: Array) -> Array:
-    """The state of least A^T Q A that exactly fits fewer measurements than unknowns (6.11).
-
-    Computed as Q^-1 C^T (C Q^-1 C^T)^-1 R, the result of the recursion that starts at zero with the
-    covariance Q^-1 and takes measurements without noise.
-    """
-    spread = np.linalg.solve(norm, rows.T)
-    return np.asarray(spread @ np.linalg.solve(rows @ spread, values))

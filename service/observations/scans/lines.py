@@ -85,20 +85,6 @@ def cross_scan(
     )
 
 
-def mean_of_scans(scans: npt.ArrayLike, spacing: float, noise_sigma: float) -> ScanResult:
-    """The mean displacement of M scans (M, samples) of one place, with 1/M of the variance.
-
-    Each scan must hold enough light by itself, as in the report; otherwise add the samples first.
-    """
-    each = [cross_scan(scan, spacing, noise_sigma) for scan in np.atleast_2d(scans)]
-    m = len(each)
-    return ScanResult(
-        float(np.mean([one.displacement for one in each])),
-        math.sqrt(sum(one.sigma**2 for one in each)) / m,
-        float(min(one.signal_ratio for one in each)),
-    )
-
-
 def line_peaks(sums: Vector, threshold: float) -> Vector:
     """Places of the maxima of `sums` above `threshold`, rising, in lines from the first one.
 

@@ -43,13 +43,13 @@ class GuideKey:
     slaves: int
 
 
-def build_guide(run_catalog: RunCatalog, reach_deg: float, slaves: int = SLAVES) -> Guide:
+def build_guide(run_catalog: RunCatalog, reach_deg: float) -> Guide:
     """The guide database of a run catalog for fields of view of a given radius."""
     return Guide(
         run_catalog.direction,
         read_only(densities(run_catalog.direction)),
         build_star_buckets(run_catalog.direction),
-        build_triangles(run_catalog.direction, reach_deg, slaves),
+        build_triangles(run_catalog.direction, reach_deg, SLAVES),
     )
 
 

@@ -14,13 +14,13 @@ import numpy as np
 
 from service.compiled.jit import njit
 from service.identify.triangles.triangle_match import MAX_MATCHES, SIGMAS
-from service.simulate.scenes import Scene
 from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.geometry.directions import separation_rad
 from service.sky.geometry.kvector import KVector, build_kvector, rows_within
 from service.sky.geometry.triangles import REACH_DEG, chords, nearest_slaves
 from service.vectors import Vector, locked, read_only
 from studies.ptp_2015.rivals.proposed import Proposed, Rows, proposed_by_votes
+from studies.scenes import Scene
 
 NEIGHBOURS = 4
 _PAIRS = np.array(list(combinations(range(NEIGHBOURS), 2)))

@@ -14,12 +14,12 @@ import numpy.typing as npt
 
 from service.compiled.jit import njit
 from service.identify.triangles.triangle_match import SIGMAS, spread_along
-from service.simulate.scenes import Scene
 from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.geometry.kvector import KVector, build_kvector, rows_within
 from service.sky.geometry.pairs import build_pairs
 from service.vectors import Vector, locked, read_only
 from studies.ptp_2015.rivals.proposed import Proposed
+from studies.scenes import Scene
 
 SIDE_MAX_DEG = 10.0
 """Longest side of a triangle in degrees, equal to the field of view."""

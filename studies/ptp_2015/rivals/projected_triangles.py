@@ -21,7 +21,6 @@ from service.identify.triangles.triangle_match import (
     guide_triangles,
     match_triangles,
 )
-from service.simulate.scenes import Scene
 from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.geometry.triangles import (
     REACH_DEG,
@@ -34,6 +33,7 @@ from service.sky.geometry.triangles import (
 )
 from service.vectors import locked
 from studies.ptp_2015.rivals.proposed import Proposed, proposed_by_votes
+from studies.scenes import Scene
 
 NEIGHBOURS_WITHIN_DEG = 5.0
 BRIGHTEST = 2

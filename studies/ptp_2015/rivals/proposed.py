@@ -7,8 +7,8 @@ import numpy as np
 import numpy.typing as npt
 
 from service.identify.triangles.triangle_match import count_pairs, validate
-from service.simulate.scenes import Scene
 from service.sky.catalog.run_catalog import RunCatalog
+from studies.scenes import Scene
 
 Rows = npt.NDArray[np.int32]
 

@@ -13,13 +13,13 @@ import numpy as np
 
 from service.compiled.jit import njit
 from service.identify.triangles.triangle_match import SIGMAS
-from service.simulate.scenes import Scene
 from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.geometry.directions import separation_rad
 from service.sky.geometry.kvector import KVector, build_kvector, rows_within
 from service.sky.geometry.pairs import build_pairs
 from service.vectors import Vector, locked
 from studies.ptp_2015.rivals.proposed import Proposed, Rows
+from studies.scenes import Scene
 
 SEPARATION_MAX_DEG = 14.2
 """Largest separation of indexed pairs in degrees, the diagonal of the field."""

@@ -9,7 +9,6 @@ import pytest
 from scipy.stats import binomtest, poisson
 
 from service.errors import BadInput
-from service.simulate.scenes import Conditions, SceneSky, draw_scenes
 from service.vectors import angle_between_deg, unit
 from studies.ptp_2015 import tables
 from studies.ptp_2015.command import CASES, run_ptp
@@ -30,6 +29,7 @@ from studies.ptp_2015.projections import printed_slope
 from studies.ptp_2015.rivals.liebe import features
 from studies.ptp_2015.rivals.planar_triangle import area_and_moment, area_and_moment_sigma
 from studies.ptp_2015.tables import OF_PROJECTIONS, TITLES
+from studies.scenes import Conditions, SceneSky, draw_scenes
 
 PIXEL_RAD = Conditions().camera.pixel_rad
 SCENES = 60

@@ -7,7 +7,6 @@ import pytest
 
 from service.errors import BadInput
 from service.imaging.centroids.psf import GaussianPsf
-from service.imaging.optics import PointImage, image_by_fft
 from service.vectors import ARCSEC_PER_RADIAN
 from studies.star_image_report.correlate import (
     displacement_by_derivative,
@@ -19,6 +18,7 @@ from studies.star_image_report.correlate import (
     overlap,
     search_by_axes,
 )
+from studies.star_image_report.transfer import PointImage, image_by_fft
 from studies.star_image_report.wires import INCH_M, filtered
 from tests.imaging.optics import DIAMETER_M, LASER_M
 

@@ -5,8 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from service.observations.scans.lines import cross_scan, mean_of_scans
+from service.observations.scans.lines import cross_scan
 from studies.star_image_report.scanning import (
+    mean_of_scans,
     nyquist_spacing,
     truncated,
     variance_in_full,

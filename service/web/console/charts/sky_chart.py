@@ -135,10 +135,10 @@ def text_box(text: str, x: float, y: float, font: Font = NAME) -> Box:
     return x, top, x + font.character * len(text), top + font.height
 
 
-def points_along(start: Place, end: Place, step: float = 5.0) -> list[Place]:
-    """Points along a line at most one step apart."""
+def points_along(start: Place, end: Place) -> list[Place]:
+    """Points along a line at most five pixels apart."""
     (x1, y1), (x2, y2) = start, end
-    count = 1 + int(max(abs(x2 - x1), abs(y2 - y1)) / step)
+    count = 1 + int(max(abs(x2 - x1), abs(y2 - y1)) / 5.0)
     return [(x1 + (x2 - x1) * k / count, y1 + (y2 - y1) * k / count) for k in range(count + 1)]
 
 

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from service.missions.mission import RunCatalogSettings
 from service.sky.catalog.run_catalog import RunCatalog, build_run_catalog
-from service.sky.catalog.star_catalog import Catalog, load_embedded
+from service.sky.catalog.star_catalog import load_embedded
 from service.vectors import Matrix, Vector, matrix_from_quaternion, read_only, unit
 
 EPOCH_YEAR = 2000.0
@@ -124,12 +124,12 @@ class SceneSky:
     run_catalog: RunCatalog
 
     @classmethod
-    def to_magnitude(cls, limit_mag: float, catalog: Catalog | None = None) -> "SceneSky":
+    def to_magnitude(cls, limit_mag: float) -> "SceneSky":
         """Sky of the stars down to a magnitude limit; a brighter limit gives fewer of its rows."""
         settings = RunCatalogSettings(
             magnitude_limit_mag=limit_mag, merge_within_arcsec=MERGE_WITHIN_ARCSEC
         )
-        return cls(build_run_catalog(catalog or load_embedded(), settings, EPOCH_YEAR))
+        return cls(build_run_catalog(load_embedded(), settings, EPOCH_YEAR))
 
     @classmethod
     def for_conditions(cls, conditions: Conditions) -> "SceneSky":

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from service.simulate.scenes import (
+from service.vectors import angle_between_deg
+from studies.scenes import (
     Conditions,
     PinholeCamera,
     SceneSky,
@@ -11,7 +12,6 @@ from service.simulate.scenes import (
     draw_scene,
     draw_scenes,
 )
-from service.vectors import angle_between_deg
 
 
 @pytest.fixture(scope="module")
