@@ -34,6 +34,14 @@ class Interval:
         """Interval of the estimate multiplied by a positive factor."""
         return Interval(self.value * factor, self.low * factor, self.high * factor)
 
+    def moved(self, by: float) -> "Interval":
+        """Interval of the estimate plus a constant."""
+        return Interval(self.value + by, self.low + by, self.high + by)
+
+    def differs(self, other: "Interval") -> bool:
+        """True if the two intervals have no value in common."""
+        return self.low > other.high or self.high < other.low
+
     def holds(self, value: float) -> bool:
         """True if a value lies within the confidence interval."""
         return self.low <= value <= self.high
@@ -49,11 +57,14 @@ def wilson(share: float, count: float) -> Interval:
 
 def effective_count(marks: npt.NDArray[np.bool_], cluster: Clusters) -> float:
     """Effective number of independent trials in clustered boolean values (n,)."""
-    n, share = len(marks), float(marks.mean())
+    excess = np.bincount(cluster, weights=marks - marks.mean()).astype(float)
+    return _effective(float(marks.mean()), len(marks), excess, len(np.unique(cluster)))
+
+
+def _effective(share: float, n: int, excess: Vector, clusters: int) -> float:
+    """Effective number of n trials; `excess` is by how much each cluster exceeds the share."""
     if share in (0.0, 1.0):
         return float(n)
-    excess = np.bincount(cluster, weights=marks - share)
-    clusters = len(np.unique(cluster))
     if clusters < 2:
         return 1.0
     variance = float(excess @ excess) * clusters / (clusters - 1) / n**2
@@ -64,6 +75,12 @@ def effective_count(marks: npt.NDArray[np.bool_], cluster: Clusters) -> float:
 def share_of(marks: npt.NDArray[np.bool_], cluster: Clusters) -> Interval:
     """Share of true values among (n,), with a 95 % interval; clusters (n,) number the batches."""
     return wilson(float(marks.mean()), effective_count(marks, cluster))
+
+
+def share_of_sums(marked: Vector, whole: Vector) -> Interval:
+    """Share with a 95 % interval, from the counts of clusters (n,) of which none is empty."""
+    n, share = int(whole.sum()), float(marked.sum() / whole.sum())
+    return wilson(share, _effective(share, n, marked - share * whole, len(whole)))
 
 
 def quantile(values: Vector, cluster: Clusters, share: float) -> Interval:

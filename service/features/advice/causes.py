@@ -99,10 +99,6 @@ class StarTable:
         chosen = self.ambiguous if of is None else self.ambiguous[of]
         return float(chosen.mean()) if len(chosen) else float("nan")
 
-    def share_of(self, outcome: str) -> float:
-        """Share of all stars with the outcome `u`, `a` or `m`."""
-        return float(np.mean(self.outcome == outcome)) if len(self.outcome) else 0.0
-
     def reported(self, tracker: int) -> Vector:
         """Number of stars (b,) that a tracker reported in each batch."""
         own = self.batch[self.tracker == tracker]
@@ -315,6 +311,23 @@ def _a_priori(now: StarTable, before: StarTable | None) -> Iterator[Factor]:
     yield Factor(beyond, stars, text, f"{evidence}.", remedy)
 
 
+def _wider_zone(now: StarTable, before: StarTable | None) -> Iterator[Factor]:
+    """Detect a zone that was made larger, so that more catalog stars compete."""
+    if before is None:
+        return
+    room_before = float(np.nanmedian(before.room_deg))
+    wider = now.room_deg > room_before + 0.01
+    if wider.any():
+        yield Factor(
+            wider,
+            wider[now.batch],
+            "The zone was made larger: more stars of the catalog compete for each observed one.",
+            f"It leaves room for a priori errors of {now.room_deg[wider].max():.2f}°, before of "
+            f"{room_before:.2f}°.",
+            "Put the former zone back if the errors of the a priori attitude fit in it.",
+        )
+
+
 def _noise(now: StarTable, before: StarTable | None) -> Iterator[Factor]:
     """Detect trackers with more noise than the mission's sigma and than in the earlier period."""
     ratios = [now.noise(number) for number in range(len(now.trackers))]
@@ -431,6 +444,7 @@ def _both(
 
 FACTORS: tuple[Callable[[StarTable, StarTable | None], Iterator[Factor]], ...] = (
     _a_priori,
+    _wider_zone,
     _noise,
     _sensitivity,
     _density,
@@ -467,12 +481,15 @@ class Part:
         """Change of the share of ambiguous stars in percentage points; None: no earlier share."""
         return None if self.before is None else 100.0 * (self.share.value - self.before.value)
 
+    def with_shares(self, stars: int, share: float, before: float) -> "Part":
+        """Part with the shares of whole periods, in place of those of a sample."""
+        earlier = self.before and self.before.moved(before - self.before.value)
+        return Part(self.name, stars, self.share.moved(share - self.share.value), earlier)
+
     @property
     def is_certain(self) -> bool:
-        """True if the change is significant: the 95 % intervals of both periods do not overlap."""
-        return self.before is not None and (
-            self.share.low > self.before.high or self.share.high < self.before.low
-        )
+        """True if the change is beyond chance: the intervals of the two periods differ."""
+        return self.before is not None and self.share.differs(self.before)
 
 
 def parts(now: StarTable, before: StarTable | None) -> list[Part]:

@@ -3,7 +3,7 @@
 import math
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -48,7 +48,8 @@ from service.storage.queries.definitive import latest_innovations
 from service.storage.queries.pages import ResultFilter, latest_time
 from service.storage.queries.period import sample_period
 from service.storage.queries.results import BatchSample, sample_batches
-from service.storage.queries.time_buckets import BucketFilter
+from service.storage.queries.time_buckets import BucketFilter, read_buckets, totals
+from service.storage.sql.tables import COUNTS
 from service.times import DAY_S, Utc, recorded_utc, shifted, utc_now
 
 ADVICE_SAMPLE = 200
@@ -61,20 +62,20 @@ CAUSES_SAMPLE = 300
 
 @dataclass(frozen=True)
 class Ambiguity:
-    """Ambiguous stars of a period compared with an earlier one, with causes and rival stars."""
+    """Ambiguous stars of a period compared with an earlier one, with causes and rival stars.
+
+    The first part and the counts are those of the whole periods; the rest is from a sample.
+    """
 
     parts: list[Part]
     causes: list[records.Cause]
     rivals: list[tuple[str, int]]
     batches: int
     total: int
-    unmatched: float
-    unmatched_before: float | None
-
-    @property
-    def ambiguous(self) -> int:
-        """Number of ambiguous stars in the period."""
-        return round(self.parts[0].stars * self.parts[0].share.value)
+    ambiguous: int
+    """Number of ambiguous stars in the sample."""
+    counts: Mapping[str, int]
+    counts_before: Mapping[str, int] | None
 
 
 MOST_ERRORS = 10_000
@@ -137,14 +138,29 @@ class AdviceService:
         now = self._stars(name, run, start, end)
         before = self._stars(name, run, shifted(start, -earlier_s), shifted(end, -earlier_s))
         earlier = before if before.batches else None
+        with self._context.reading() as connection:
+            counts, counts_before = (
+                totals(read_buckets(connection, BucketFilter(name, run, *each), "hour", COUNTS))
+                for each in (
+                    (start, end),
+                    (shifted(start, -earlier_s), shifted(end, -earlier_s)),
+                )
+            )
+        found = parts(now, earlier)
+        if found and counts["observed"]:
+            share, before_share = (
+                each["ambiguous"] / max(each["observed"], 1) for each in (counts, counts_before)
+            )
+            found[0] = found[0].with_shares(counts["observed"], share, before_share)
         return Ambiguity(
-            parts=parts(now, earlier),
+            parts=found,
             causes=causes(now, earlier),
             rivals=common_rivals(now),
             batches=now.batches,
             total=now.total,
-            unmatched=now.share_of("m"),
-            unmatched_before=None if earlier is None else earlier.share_of("m"),
+            ambiguous=int(now.ambiguous.sum()),
+            counts=counts,
+            counts_before=None if earlier is None else counts_before,
         )
 
     def _run_with(self, mission: Mission, batch: ObservationBatch) -> Acquisition:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Literal
 
@@ -13,6 +13,7 @@ from sqlalchemy import BigInteger, Connection, Select, bindparam, case, func, se
 from service.contract.alarms import Alarm, AlarmSummary
 from service.contract.answers import Summary
 from service.contract.spacecraft import Overview, OverviewRow, Sparkline, WindowCounts
+from service.intervals import share_of_sums
 from service.missions.mission import Mission
 from service.observations.schema import LIVE
 from service.storage.queries import time_buckets
@@ -26,7 +27,16 @@ from service.storage.recording.unsaved_result import AHEAD_NS
 from service.storage.sql import tables
 from service.storage.sql.columns import Row
 from service.storage.sql.tables import COUNTS, batches, results
-from service.times import DAY_S, HOUR_S, UNIX_DAY, Utc, recorded_utc, shifted, unix_seconds
+from service.times import (
+    DAY_S,
+    HOUR_S,
+    UNIX_DAY,
+    Utc,
+    bucket_start,
+    recorded_utc,
+    shifted,
+    unix_seconds,
+)
 from service.trends.limits import Severity
 from service.vectors import Matrix
 
@@ -64,12 +74,14 @@ class KnownAttitude:
 
 @dataclass(frozen=True)
 class DayCounts:
-    """Counts of observed and ambiguous stars in a run's latest 24 hours, and in those before."""
+    """Counts of observed and ambiguous stars in the last day of a run, and in the day before."""
 
     observed: int = 0
     ambiguous: int = 0
     observed_before: int = 0
     ambiguous_before: int = 0
+    is_certain: bool = field(default=False, compare=False)
+    """True if the shares differ by more than chance, where each hour is one trial."""
 
     @property
     def points(self) -> float | None:
@@ -399,26 +411,29 @@ def _hours(
     ]
 
 
+def last_day(as_of: Utc) -> tuple[Utc, Utc]:
+    """Start and end of a run's last day: 24 whole hours, the last with the latest batch."""
+    hour = as_of.bucket(HOUR_S) + 1
+    return bucket_start(hour - 24, HOUR_S), bucket_start(hour, HOUR_S)
+
+
 def _days(connection: Connection, names: list[str], run: str, as_of: Utc) -> dict[str, DayCounts]:
-    """Star counts by spacecraft of the latest 24 hours of a run, and of the 24 hours before."""
-    last_s = float(unix_seconds([as_of.tai_ns])[0]) // HOUR_S * HOUR_S
-    found: dict[str, DayCounts] = {}
+    """Star counts by spacecraft of the last day of a run, and of the day before."""
+    begin_s = float(unix_seconds([last_day(as_of)[0].tai_ns])[0])
+    hours: dict[str, tuple[list[Any], list[Any]]] = {name: ([], []) for name in names}
     for name, at_s, *counts in _hours(connection, names, run, as_of, 2 * DAY_S, HOUR_S):
-        one, known = dict(zip(COUNTS, map(int, counts), strict=True)), found.get(name, DayCounts())
-        if at_s > last_s - DAY_S:
-            known = replace(
-                known,
-                observed=known.observed + one["observed"],
-                ambiguous=known.ambiguous + one["ambiguous"],
-            )
-        elif at_s > last_s - 2 * DAY_S:
-            known = replace(
-                known,
-                observed_before=known.observed_before + one["observed"],
-                ambiguous_before=known.ambiguous_before + one["ambiguous"],
-            )
-        found[name] = known
-    return found
+        one = dict(zip(COUNTS, map(int, counts), strict=True))
+        if at_s >= begin_s - DAY_S and one["observed"]:
+            hours[name][at_s < begin_s].append((one["observed"], one["ambiguous"]))
+    return {name: _day_counts(*map(np.array, each)) for name, each in hours.items() if each[0]}
+
+
+def _day_counts(day: Matrix, before: Matrix) -> DayCounts:
+    """Sums over the hours of a day and of the day before, each with observed and ambiguous."""
+    if not len(before):
+        return DayCounts(*day.sum(axis=0).tolist())
+    is_certain = share_of_sums(*day.T[::-1]).differs(share_of_sums(*before.T[::-1]))
+    return DayCounts(*day.sum(axis=0).tolist(), *before.sum(axis=0).tolist(), is_certain)
 
 
 _IN_NAMES = results.c.spacecraft.in_(bindparam("names", expanding=True))

@@ -73,7 +73,7 @@ def compare(app, missions, seed):
 def test_the_cause_of_a_bad_day_is_named_with_what_it_explains(compare, changed, cause):
     found = compare(**changed)
     assert found.batches == found.total == BATCHES
-    assert found.unmatched_before is not None
+    assert found.counts_before is not None
     told = {each.text: each for each in found.causes}
     assert cause in told
     assert 0 < told[cause].batches <= BATCHES
@@ -93,7 +93,7 @@ def test_without_an_earlier_day_nothing_is_compared(app, missions, seed):
     fly(app, missions["XTE"], BEGIN, seed, false_stars=2)
     begin = parse_utc(BEGIN)
     found = app.part(AdviceService).ambiguity("XTE", "live", begin, shifted(begin, DAY_S))
-    assert found.unmatched_before is None
+    assert found.counts_before is None
     assert all(each.before is None for each in found.parts)
     assert ["no stars of the catalog" in each.text for each in found.causes] == [True]
 

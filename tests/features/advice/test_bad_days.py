@@ -1,0 +1,59 @@
+"""Is ambiguity worse than yesterday, and why: asked of the console's pages from the overview on."""
+
+import html
+import re
+
+import httpx
+import pytest
+
+from service.times import HOUR_S, bucket_start, utc_now
+from tests.features.advice.bad_days import CASES, two_days
+
+BATCHES = 48
+STARS = r"([\d\N{NARROW NO-BREAK SPACE}]+) of ([\d\N{NARROW NO-BREAK SPACE}]+) stars"
+
+
+def text_of(part):
+    return re.sub(r"\s+", " ", html.unescape(re.sub(r"<[^>]+>", " ", part)))
+
+
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory):
+    """Row of each spacecraft in the overview, and the page to which its change leads."""
+    end = bucket_start(utc_now().bucket(HOUR_S), HOUR_S)
+    with (
+        two_days(tmp_path_factory.mktemp("days"), end, BATCHES) as address,
+        httpx.Client(base_url=address, timeout=120) as client,
+    ):
+        overview, found = client.get("/").raise_for_status().text, {}
+        for case in CASES:
+            (row,) = re.findall(
+                rf"<tr[^>]*>(?:(?!</tr>).)*/{case.name}\?(?:(?!</tr>).)*</tr>", overview, re.DOTALL
+            )
+            link = html.unescape(re.search(r'href="([^"]*before=day[^"]*)"', row)[1])
+            found[case.name] = row, client.get(link).raise_for_status().text
+        yield found
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_the_change_leads_to_its_cause_and_to_the_same_figures(pages, case):
+    row, page = pages[case.name]
+    title = re.search(r'before=day[^>]*title="([^"]*)"', row)[1]
+    panel = text_of(re.search(r'<div id="why".*?</section>', page, re.DOTALL)[0])
+    told = re.search(
+        rf"ambiguous stars \w+ before.*?: (\S+) points, {STARS}.*?, before {STARS}", panel
+    )
+    assert told, panel
+    assert f"{told[1]} in {told[3]}" in text_of(row)
+    assert title.removeprefix("Within chance: ") == (
+        f"{told[2]} of {told[3]} stars in the last day, {told[4]} of {told[5]} the day before"
+    )
+    causes = re.findall(r"<li><strong>(.*?)</strong>", page)
+    if case.cause:
+        assert "▲ More ambiguous stars than before" in panel
+        assert "▲" in text_of(re.search(r"before=day.*?</a>", row, re.DOTALL)[0])
+        assert html.unescape(causes[0]) == case.cause
+    else:
+        assert "As many ambiguous stars as before, within chance" in panel
+        assert "≈" in row
+        assert causes == []
