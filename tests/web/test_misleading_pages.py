@@ -110,6 +110,20 @@ def test_of_several_alarms_the_one_that_is_worst_now_stands_for_all(small_fleet)
         "1999-060T12:00:00.000Z",
         "1999-060 12:00",
         " 1999-03-01 12:00:00 utc ",
+        "1999-03-01 (060) 12:00:00",
+        "1999-03-01 (060) 12:00",
+        "1999/060/12:00:00",
+        "1999.060.12.00.00",
+        "1999:060:12:00:00.000",
+        "060/12:00",
+        "03-01 12:00",
+        "12:00",
+        "1 Mar 1999 12:00",
+        "01-MAR-1999 12:00:00.000",
+        "March 1, 1999 12:00 GMT",
+        "1999 Mar 01 12:00",
+        "19990301T120000Z",
+        "1999-03-01T13:00+01:00",
     ],
 )
 def test_a_time_in_any_common_form_finds_the_batch(small_fleet, typed):
@@ -130,6 +144,22 @@ def test_a_time_without_a_batch_finds_the_nearest_and_says_how_far_it_is(small_f
         page = text_of(client.get("/batches", params={"find": typed, "spacecraft": "SAT-001"}))
         assert f"the nearest is {said}" in page, page
     assert parse_utc(before_all).tai_ns < fleet.END.tai_ns
+
+
+def test_each_time_that_the_overview_writes_finds_its_batch(small_fleet):
+    """Also those without a year."""
+    _, client = small_fleet
+    times = re.findall(r"<time [^>]*>([^<]*)</time>", client.get("/").text)
+    assert {len(each) for each in times} >= {len("1999-03-01 (060) 12:00"), len("03-01 12:00")}
+    for typed in set(times):
+        found = text_of(client.get("/batches", params={"find": typed}))
+        assert re.search(r"A batch at 1999|the nearest is .* (earlier|later)", found), typed
+
+
+@pytest.mark.parametrize("typed", ["2026-330-0179", "060", "12-1", "a 12:00", "1999-02-30 12:00"])
+def test_an_id_that_looks_like_a_time_is_an_id(small_fleet, typed):
+    page = text_of(small_fleet[1].get("/batches", params={"find": typed}))
+    assert "No run has a batch with this id, and it is no time in UTC" in page
 
 
 def test_what_the_example_in_a_field_shows_is_read_as_it_stands(client, full_run):
@@ -199,7 +229,7 @@ def test_the_change_since_yesterday_counts_the_hours_of_both_days(small_fleet):
             counted += [sum(each[part] for each in rates) for part in ("observed", "ambiguous")]
         assert counted[0] > counted[2] > 0
         assert row.days == DayCounts(*counted)
-        assert f"of {counted[0]}</small>" in client.get("/").text
+        assert f"in {counted[0]}</small>" in client.get("/").text
 
 
 # ---- files that are sent -------------------------------------------------------------------------

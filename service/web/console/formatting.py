@@ -11,7 +11,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from service.times import Utc, recorded_utc, shifted, utc_now
+from service.times import HOUR_S, Utc, recorded_utc, shifted, utc_now
 from service.trends.measures import SmoothedShare
 from service.trends.quantities import Quantity, quantity_named
 
@@ -48,23 +48,51 @@ STATES: Mapping[str, tuple[str, str]] = {
 """Shape and word that show a state, by the name of the state."""
 
 
+_CLOCK = r"(\d\d?)[:.](\d\d)(?:[:.](\d\d(?:\.\d{1,9})?))?"
+_DAY = r"(?:(\d{4})[-/.:])?(?:(\d\d?)[-/.](\d\d?)(?: \(\d{3}\))?|(\d{3}))"
 _TYPED = re.compile(
-    r"(\d{4}-(?:\d\d-\d\d|\d{3}))(?:[T ](\d\d:\d\d)(:\d\d(?:\.\d{1,9})?)?"
-    r" ?(Z|UTC|[+-]\d\d(?::?\d\d)?)?)?",
-    re.ASCII | re.IGNORECASE,
+    rf"(?:{_DAY}(?:[T/:.-]|,? ))?{_CLOCK} ?(Z|UTC?|GMT|[+-]\d\d(?::?\d\d)?)?|{_DAY}", re.ASCII
 )
+_MONTHS = ["JAN", "FEB", "MAR", "APR", "MAY", "JUN", "JUL", "AUG", "SEP", "OCT", "NOV", "DEC"]
+_MONTH = re.compile(rf"\b({'|'.join(_MONTHS)})[A-Z]*")
+_REORDERED = (
+    (re.compile(r"(\d\d?)[ -](\d\d)M[ -](\d{4})", re.ASCII), r"\3-\2-\1"),
+    (re.compile(r"(\d\d)M (\d\d?),? (\d{4})", re.ASCII), r"\3-\1-\2"),
+    (re.compile(r"(\d{4})[ -](\d\d)M[ -](\d\d?)", re.ASCII), r"\1-\2-\3"),
+    (re.compile(r"(\d{4})(\d\d)(\d\d)T(\d\d)(\d\d)(\d\d)", re.ASCII), r"\1-\2-\3T\4:\5:\6"),
+)
+"""Orders of a date with a month's name, now a number and M, and ISO 8601's basic form."""
 
 
-def completed_utc(text: str) -> str:
+def completed_utc(text: str, near: Utc | None = None) -> str:
     """Complete a typed time to the form that `parse_utc` reads; other text is unchanged.
 
-    A blank may replace `T`; the time of day, its seconds and the zone may be missing.
+    Read are calendar days and days of the year with any usual separator or a month's name, as the
+    pages write them, too; the seconds, the time of day and the zone may be missing.  The year
+    or the whole day may be missing if a time `near` it is given.
     """
-    match = _TYPED.fullmatch(text.strip())
+    typed = _MONTH.sub(lambda m: f"{1 + _MONTHS.index(m[1]):02d}M", " ".join(text.upper().split()))
+    for form, order in _REORDERED:
+        typed = form.sub(order, typed, count=1)
+    match = _TYPED.fullmatch(typed)
     if match is None:
         return text
-    day, clock, seconds, zone = match.groups("")
-    return f"{day}T{clock or '00:00'}{seconds or ':00'}{zone.upper().replace('UTC', 'Z')}"
+    parts = match.groups("")
+    hour, minute, second, zone = parts[4:8]
+    year, month, day, ordinal = parts[:4] if hour else parts[8:]
+    if not year:
+        if near is None or not hour:
+            return text
+        if month or ordinal:
+            days = int(ordinal) if ordinal else 30.6 * (int(month) - 1) + int(day)
+            year = str(int(near.text[:4]) + round((near.day_of_year - days) / 366))
+        else:
+            # The day on which the time of day is nearest.
+            nearest = shifted(near, 12 * HOUR_S - 1 - 60.0 * (60 * int(hour) + int(minute)))
+            year, month, day = nearest.text[:10].split("-")
+    date = f"{year}-{ordinal}" if ordinal else f"{year}-{month:0>2}-{day:0>2}"
+    zone = zone if zone[:1] in ("+", "-") else "Z"
+    return f"{date}T{hour or '00':0>2}:{minute or '00'}:{second or '00'}{zone}"
 
 
 def present() -> Utc:

@@ -97,9 +97,9 @@ class PageQuery(Query):
         }
 
 
-def typed_utc(text: str, field: str) -> Utc:
-    """Parse a time as people type it; raises `BadInput` naming the field."""
-    return parse_utc(completed_utc(text), field)
+def typed_utc(text: str, field: str, near: Utc | None = None) -> Utc:
+    """Time as people type it, see `completed_utc`; raises `BadInput` naming the field."""
+    return parse_utc(completed_utc(text, near), field)
 
 
 class PeriodQuery(PageQuery):

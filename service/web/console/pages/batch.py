@@ -273,7 +273,10 @@ def batches_page(query: FromQuery[BatchesQuery], context: ContextDep) -> Respons
     moment, nearest = None, list[tuple[Summary, float]]()
     if text := query.find.strip():
         try:
-            moment = typed_utc(text, "find")
+            latest = context.app.results.page(
+                spacecraft=query.spacecraft or None, run=query.run, limit=1
+            ).items
+            moment = typed_utc(text, "find", recorded_utc(latest[0].time) if latest else None)
         except BadInput:
             found = named(context, query, text)
             if len(found) == 1:
