@@ -11,6 +11,7 @@ import pytest
 from service.app.factory import open_app
 from service.times import parse_utc, shifted
 from service.web.app import create_app
+from service.web.console.formatting import completed_utc
 from tests.fresh_databases import sqlite_at
 from tests.storage.bulk import put, result_row
 from tests.web.browser import CHROMIUM, Browser
@@ -129,6 +130,8 @@ def test_the_first_chart_is_ambiguity_and_few_controls_stand_before_it(browser, 
     assert browser.run("document.querySelector('[data-chart]').dataset.chart") == "stars"
     controls = browser.run(BEFORE_THE_CHART)
     assert len(controls) <= 8, controls
+    # To share a view is one of them.
+    assert "Copy link" in controls
     assert browser.run("document.querySelector('[data-chart]').getBoundingClientRect().top") < 500
 
 
@@ -193,6 +196,22 @@ SIGN = """(form => { form.elements.who.value = 'J. Operator';
     document.querySelector('dialog form'))"""
 
 
+def test_a_field_for_times_reads_a_time_as_the_service_reads_it(browser, address):
+    browser.open(f"{address}/batches")
+    read = "import('{}/static/times.js').then(times => times.typedTime({}).text)"
+    for typed in (
+        "1999-03-01 (060) 13:52:00",
+        "1999-03-01 (060) 13:52",
+        "1999-060/13:52:00.250",
+        "1999/3/1 9:05 utc",
+        "1999.060.13.52.07",
+        "1999-03-01T13:52:00+01:30",
+        "1999-060",
+    ):
+        found = browser.run(read.format(address, json.dumps(typed)))
+        assert parse_utc(found) == parse_utc(completed_utc(typed)), typed
+
+
 def test_a_bad_time_is_told_beside_its_field_and_the_form_is_kept(browser, address, full_run):
     browser.open(f"{address}/batches?run={full_run}")
     fill = "document.querySelector('[name={0}]').value = '{1}'"
@@ -224,8 +243,22 @@ def test_a_bad_time_is_told_beside_its_field_and_the_form_is_kept(browser, addre
 def test_a_point_of_a_trend_leads_to_its_batches_and_lines_can_be_hidden(
     browser, address, full_run
 ):
-    browser.open(f"{address}/spacecraft/XTE?run={full_run}&beside=SOHO")
+    browser.open(f"{address}/spacecraft/XTE?run={full_run}")
     browser.wait(lambda: browser.run(DRAWN))
+    # Further spacecraft are added one by one, and leave by a button.
+    browser.run("document.querySelector('#more').open = true")
+    add = (
+        "(menu => {{ menu.value = '{}';"
+        "menu.dispatchEvent(new Event('change', {{bubbles: true}})); }})"
+        "(document.querySelector('[data-view] [name=beside]:not([type=hidden])'))"
+    )
+    for name in ("SWAS", "SOHO"):
+        browser.run(add.format(name))
+        shows(browser, f"Without {name}", "#more")
+    leave = "[...document.querySelectorAll('#more a')].find(e => e.innerText === 'Without SWAS')"
+    browser.run(f"{leave}.click()")
+    browser.wait(lambda: "Without SWAS" not in text(browser, "#more"))
+    assert "Without SOHO" in text(browser, "#more")
     browser.wait(lambda: "SOHO" in text(browser, "[data-chart=stars] + .chart-keys"))
     key = "document.querySelector('[data-chart=stars] + .chart-keys button')"
     browser.run(f"{key}.click()")

@@ -195,7 +195,9 @@ def spacecraft_page(name: str, query: FromQuery[SpacecraftQuery], context: Conte
         why=context.panels("ambiguity", name, query.run, stretch, before) if before else [],
         vertical=VERTICAL,
         others=_others(context, query, stretch),
-        spacecraft=[each for each in context.spacecraft if each != name],
+        spacecraft=[each for each in context.spacecraft if each not in (name, *query.others)]
+        if len(query.others) < MOST_BESIDE
+        else [],
         changes=_changes(context, name, state.history, query, stretch),
         annotations=sorted(notes.items, key=lambda each: recorded_utc(each.start).tai_ns),
         more_annotations=notes.next_cursor is not None,
