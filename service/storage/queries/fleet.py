@@ -421,10 +421,10 @@ def _days(connection: Connection, names: list[str], run: str, as_of: Utc) -> dic
     """Star counts by spacecraft of the last day of a run, and of the day before."""
     begin_s = float(unix_seconds([last_day(as_of)[0].tai_ns])[0])
     hours: dict[str, tuple[list[Any], list[Any]]] = {name: ([], []) for name in names}
+    observed, ambiguous = (COUNTS.index(each) for each in ("observed", "ambiguous"))
     for name, at_s, *counts in _hours(connection, names, run, as_of, 2 * DAY_S, HOUR_S):
-        one = dict(zip(COUNTS, map(int, counts), strict=True))
-        if at_s >= begin_s - DAY_S and one["observed"]:
-            hours[name][at_s < begin_s].append((one["observed"], one["ambiguous"]))
+        if at_s >= begin_s - DAY_S and counts[observed]:
+            hours[name][at_s < begin_s].append((int(counts[observed]), int(counts[ambiguous])))
     return {name: _day_counts(*map(np.array, each)) for name, each in hours.items() if each[0]}
 
 
