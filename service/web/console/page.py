@@ -98,7 +98,7 @@ class PageQuery(Query):
 
 
 def typed_utc(text: str, field: str, near: Utc | None = None) -> Utc:
-    """Time as people type it, see `completed_utc`; raises `BadInput` naming the field."""
+    """Parse a time as people type it, see `completed_utc`; raises `BadInput` naming the field."""
     return parse_utc(completed_utc(text, near), field)
 
 

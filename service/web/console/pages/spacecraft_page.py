@@ -1,4 +1,4 @@
-"""Page of one spacecraft: trends over a period, its worst and its latest batches."""
+"""Page of one spacecraft: trends over a period, and its worst batches."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -46,8 +46,8 @@ Range = Annotated[
 ]
 """Length of a period that ends with the latest batch: by name, or such as `6h`."""
 BEFORE_S = {"day": DAY_S, "week": 7 * DAY_S}
-"""Offsets in seconds of an earlier period for comparison, by name."""
-WORST, LATEST = 10, 10
+"""Offset in time of an earlier period for comparison."""
+WORST = 10
 MOST_BESIDE = 4
 Vertical = Literal["robust", "all", "log"]
 VERTICAL: dict[Vertical, str] = {
@@ -104,11 +104,8 @@ class SpacecraftQuery(PageQuery):
     @classmethod
     def _without_empty_fields(cls, value: object, info: ValidationInfo) -> object:
         """Treat an empty field of the form as missing."""
-        default = cls.model_fields[info.field_name or ""].default
-        if value == "":
-            return default
-        is_time = info.field_name != "range" and isinstance(value, str)
-        return completed_utc(str(value)) if is_time else value
+        is_time = info.field_name != "range" and isinstance(value, str) and value
+        return completed_utc(str(value)) if is_time else value or None
 
 
 def range_s(text: str) -> int:
@@ -159,9 +156,9 @@ class DrawnLimits:
 
 @console_page("/spacecraft/{name}", "Spacecraft", Policy("read", "path"), section="/")
 def spacecraft_page(name: str, query: FromQuery[SpacecraftQuery], context: ContextDep) -> Response:
-    """Page of one spacecraft in a run: trends, worst batches, and latest ones."""
+    """Page of one spacecraft in a run: trends, and worst batches."""
     state = context.app.spacecraft.state(name, query.run)
-    latest = context.app.results.page(spacecraft=name, run=query.run, limit=LATEST).items
+    latest = context.app.results.page(spacecraft=name, run=query.run, limit=1).items
     stretch = shown_period(context, name, query, latest)
     trackers = context.app.context.trackers(name)
     ranking = _worst(context, name, query, stretch)
