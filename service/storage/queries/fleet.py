@@ -80,7 +80,7 @@ class DayCounts:
     ambiguous: int = 0
     observed_before: int = 0
     ambiguous_before: int = 0
-    is_certain: bool = field(default=False, compare=False)
+    is_certain: bool = field(default=False, compare=False, kw_only=True)
     """True if the shares differ by more than chance, where each hour is one trial."""
 
     @property
@@ -430,10 +430,11 @@ def _days(connection: Connection, names: list[str], run: str, as_of: Utc) -> dic
 
 def _day_counts(day: Matrix, before: Matrix) -> DayCounts:
     """Sums over the hours of a day and of the day before, each with observed and ambiguous."""
+    sums = [int(each) for part in (day, before) if len(part) for each in part.sum(axis=0)]
     if not len(before):
-        return DayCounts(*day.sum(axis=0).tolist())
-    is_certain = share_of_sums(*day.T[::-1]).differs(share_of_sums(*before.T[::-1]))
-    return DayCounts(*day.sum(axis=0).tolist(), *before.sum(axis=0).tolist(), is_certain)
+        return DayCounts(*sums)
+    shares = [share_of_sums(part[:, 1], part[:, 0]) for part in (day, before)]
+    return DayCounts(*sums, is_certain=shares[0].differs(shares[1]))
 
 
 _IN_NAMES = results.c.spacecraft.in_(bindparam("names", expanding=True))

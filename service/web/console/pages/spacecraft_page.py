@@ -46,7 +46,7 @@ Range = Annotated[
 ]
 """Length of a period that ends with the latest batch: by name, or such as `6h`."""
 BEFORE_S = {"day": DAY_S, "week": 7 * DAY_S}
-"""Offset in time of an earlier period for comparison."""
+"""Offsets in seconds of an earlier period for comparison, by name."""
 WORST = 10
 MOST_BESIDE = 4
 Vertical = Literal["robust", "all", "log"]
