@@ -1,7 +1,7 @@
 """Blind solution of a picture from any lens: attitude, lens and stars, without a mission."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
@@ -15,6 +15,7 @@ from service.acquire.picture_remarks import (
     remarks_on,
     remarks_on_light,
 )
+from service.acquire.square_pixels import averaged, with_square_pixels
 from service.errors import BadInput, Fault, shown_value
 from service.identify.blind.lens import (
     PROJECTIONS,
@@ -207,7 +208,8 @@ def solve_picture(
 ) -> PictureResult:
     """Find the attitude and the lens of a picture; `guess_px` is a rough focal length.
 
-    With a `projection` the result is for the whole picture with that lens, or without an attitude;
+    Where the sides of a pixel are unequal, the picture is first solved with square ones. With a
+    `projection` the result is for the whole picture with that lens, or without an attitude;
     see `_of_fisheye`.
 
     If the stated focal length fails, all others are tried, and if the clear candidates fail,
@@ -218,6 +220,13 @@ def solve_picture(
     light.
     """
     require_light(frame, math.inf)
+    if frame.pixel_ratio not in (None, 1.0):
+        square, remark, share = with_square_pixels(frame)
+        guess = None if guess_px is None else guess_px * share
+        found = solve_picture(square, sky, solver, guess, whole_only, projection)
+        if found.attitude is not None:
+            return replace(found, remarks=(remark, *found.remarks))
+        frame = replace(frame, pixel_ratio=None)
     if projection not in (None, "gnomonic"):
         return _of_fisheye(frame, sky, solver, guess_px, projection)
     side = max(frame.width_px, frame.height_px)
@@ -254,7 +263,7 @@ def solve_picture(
             wide = _from_middle(whole, points, sky, solver, None, projections)
             if wide is not None:
                 return wide
-        for changed, remark in _averaged(frame):
+        for changed, remark in averaged(frame):
             found = _solved_part(changed, sky, solver, None)
             if found.attitude is not None:
                 return replace(found, remarks=(remark, *found.remarks))
@@ -406,20 +415,6 @@ def _widened(
     )
     search = BlindResult(best, best.log_odds, 0, 0, 0, False)
     return PictureResult(frame, points, whole, search, remarks)
-
-
-def _averaged(frame: Frame) -> Iterator[tuple[Frame, str]]:
-    """Versions of a picture with pixels averaged in pairs, each with a remark on the change."""
-    height, width = frame.counts.shape
-    for name, counts in (
-        ("columns", frame.counts[:, : width // 2 * 2].reshape(height, -1, 2).mean(axis=2)),
-        ("rows", frame.counts[: height // 2 * 2].reshape(-1, 2, width).mean(axis=1)),
-    ):
-        remark = (
-            f"unequal_pixels: the pixels fit the sky once pairs of {name} are averaged, as after "
-            "binning 1 x 2; places and focal length are in pixels of the averaged picture"
-        )
-        yield replace(frame, counts=counts), remark
 
 
 def _refused_trails(frame: Frame, points: PointSources) -> PictureResult:

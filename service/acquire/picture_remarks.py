@@ -79,7 +79,7 @@ def advice_on(points: PointSources, frame: Frame, guess_px: float | None) -> Ite
         yield (
             f"no_match: {clear} clear points fit no sky behind a lens of {least_deg:g} to "
             f"{most_deg:g} degrees: they may be no stars, or the lens may be too wide "
-            "(--lens NAME), or the pixels of unequal sides"
+            "(--lens NAME), or the pixels of unequal sides (--pixel-ratio RATIO)"
         )
     yield from remarks_on_light(points, dark)
     if guess_px is None:

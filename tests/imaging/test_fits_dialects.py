@@ -48,6 +48,21 @@ def values(rng):
 
 TIMES = {
     "start and exposure in the primary header": ({}, {"DATE-OBS": NOON, "EXPTIME": 4.0}, 2.0),
+    "a Julian date within the exposure": (
+        {"DATE-OBS": NOON, "JD": 2461101.00002, "EXPTIME": 4.0},
+        {},
+        2.0,
+    ),
+    "a stack with its end": (
+        {"DATE-OBS": NOON, "DATE-END": "2026-03-01T12:00:04", "EXPTIME": 4.0, "NCOMBINE": 4},
+        {},
+        2.0,
+    ),
+    "the local time of Greenwich": (
+        {"DATE-OBS": NOON, "EXPTIME": 4.0, "LT": "12:00:00", "TIMEZONE": 0},
+        {},
+        2.0,
+    ),
     "start with a Z": ({"DATE-OBS": NOON + ".000Z", "EXPTIME": 4.0}, {}, 2.0),
     "start in the extension": ({"DATE-OBS": NOON}, {"EXPTIME": 4.0}, 2.0),
     "the extension's own start": (
@@ -241,6 +256,22 @@ NO_TIMES = {
         "EXPTIME is 5000 s, and may be from 0 to 3600 s",
     ),
     "exposure in furlongs": ({"DATE-OBS": NOON, "EXPTIME": (1.0, "[furlong]")}, "no exposure"),
+    "a Julian date of another day": (
+        {"DATE-OBS": NOON, "JD": 2461102.0, "EXPTIME": 4.0},
+        "JD 2461102.0 is 86400 s later",
+    ),
+    "a modified Julian date of another day": (
+        {"DATE-OBS": NOON, "MJD": 61099.5, "EXPTIME": 4.0},
+        "MJD 61099.5 is -86400 s later",
+    ),
+    "a stack without its end": (
+        {"DATE-OBS": NOON, "EXPTIME": 4.0, "STACKCNT": 30},
+        "it is a stack of 30 exposures (STACKCNT) without DATE-END",
+    ),
+    "the clock of a zone": (
+        {"DATE-OBS": NOON, "EXPTIME": 4.0, "LT": "12:00:00", "TIMEZONE": 9},
+        "DATE-OBS is 2026-03-01T12:00:00, the local time of LT",
+    ),
     "a day that is none": ({"DATE-AVG": "2026-02-30T12:00:00"}, "cannot be read"),
 }
 

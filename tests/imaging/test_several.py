@@ -155,6 +155,19 @@ def test_portable_maps_one_behind_the_other_are_refused(values):
         read(one + one)
 
 
+def test_a_second_sample_that_is_no_opacity_is_named(values):
+    file = io.BytesIO()
+    planes = {"photometric": "minisblack", "planarconfig": "separate", "metadata": None}
+    tifffile.imwrite(file, values[:2], **planes)
+    assert any("the first of two samples" in each for each in read(file.getvalue()).remarks)
+
+
+def test_an_array_with_a_last_axis_of_one_is_one_image(values):
+    file = io.BytesIO()
+    np.save(file, values[0][..., None])
+    assert np.array_equal(read(file.getvalue()).counts, values[0])
+
+
 def test_a_stack_that_is_cut_off_is_refused(values):
     data = tiff_of(values, imagej=True)
     with pytest.raises(BadFile, match=r"cut off|without data"):

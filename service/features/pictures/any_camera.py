@@ -4,6 +4,7 @@ import json
 import sys
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -39,6 +40,12 @@ def extend(parser: ArgumentParser) -> None:
         choices=("gnomonic", "equidistant", "equisolid", "stereographic"),
         help="projection: gnomonic (on a plane) or of a fisheye; default: whatever fits",
     )
+    lens.add_argument(
+        "--pixel-ratio",
+        type=positive,
+        metavar="RATIO",
+        help="width of a pixel over its height; default: from the FITS header, else 1",
+    )
 
 
 def add_camera_options(options: "ArgumentParser | ArgumentGroup") -> None:
@@ -68,7 +75,7 @@ def run(parsed: Namespace) -> int:
     """
     if parsed.spacecraft is None:
         return solve_pictures(parsed, settings_of(parsed))
-    for name in ("fov", "lens", "focal_px", "focal_mm", "pixel_um", "dark"):
+    for name in ("fov", "lens", "pixel_ratio", "focal_px", "focal_mm", "pixel_um", "dark"):
         value = getattr(parsed, name)
         if value is not None:
             message = "goes without --spacecraft; a mission's file describes its camera"
@@ -79,6 +86,7 @@ def run(parsed: Namespace) -> int:
 def solve_pictures(parsed: Namespace, settings: Settings) -> int:
     """Solve each picture file and print its result; returns 1 if any fails, otherwise 0."""
     from service.acquire.picture import blind_sky, solve_picture
+    from service.acquire.square_pixels import require_ratio
     from service.features.pictures.records import picture_of
     from service.sky.catalog.star_catalog import open_catalog
 
@@ -88,6 +96,9 @@ def solve_pictures(parsed: Namespace, settings: Settings) -> int:
     for file in parsed.files:
         try:
             frame = read(file, None)
+            if parsed.pixel_ratio is not None:
+                ratio = require_ratio(parsed.pixel_ratio, "--pixel-ratio")
+                frame = replace(frame, pixel_ratio=ratio)
             guess_px = focal_guess_px(parsed, frame.width_px, frame.height_px)
             result = solve_picture(frame, sky, solver, guess_px, projection=parsed.lens)
         except BadInput as error:

@@ -1,6 +1,7 @@
 """Pictures of any camera, solved one at a time without a record."""
 
 import base64
+import dataclasses
 import re
 import threading
 from typing import IO
@@ -37,6 +38,7 @@ class Pictures:
         spacecraft: str | None = None,
         field_of_view_deg: float | None = None,
         projection: Projection | None = None,
+        pixel_ratio: float | None = None,
         image: str | None = None,
         draws: bool = False,
     ) -> Picture:
@@ -66,6 +68,8 @@ class Pictures:
                 raise Busy("other pictures are being solved", 10)
             try:
                 frame = read_frame(file, limits)
+                if pixel_ratio is not None:
+                    frame = dataclasses.replace(frame, pixel_ratio=pixel_ratio)
                 if field_of_view_deg is not None:
                     side_px = max(frame.width_px, frame.height_px)
                     guess_px = focal_px_of_field(

@@ -40,6 +40,14 @@ class PictureQuery(Query):
         Projection | None,
         Field(description="How the lens projects the sky. Default: whatever fits."),
     ] = None
+    pixel_ratio: Annotated[
+        float | None,
+        Field(
+            ge=0.125,
+            le=8,
+            description="Width of a pixel over its height. Default: from the FITS header, else 1.",
+        ),
+    ] = None
     image: Annotated[str | None, Field(description="As of a frame.", examples=["SCI"])] = None
     overlay: Annotated[
         bool, Field(description="Whether the answer holds the picture with the stars.")
@@ -74,6 +82,7 @@ def solve_picture(
             spacecraft=query.spacecraft,
             field_of_view_deg=query.field_of_view_deg,
             projection=query.lens,
+            pixel_ratio=query.pixel_ratio,
             image=query.image,
             draws=query.overlay,
         )

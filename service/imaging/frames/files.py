@@ -54,6 +54,8 @@ def read_npy(file: BoundedFile, limits: FrameLimits, digest: str) -> Frame:
     if any(type(side) is not int for side in shape):
         # In Python a bool is an int, too.
         raise bad_frame("must have a shape of whole numbers", str(shape)[:80])
+    if len(shape) == 3 and shape[2] == 1:
+        shape = shape[:2]
     axis, plane, remarks = _chosen_plane(shape, limits.image)
     height_px, width_px = (side for k, side in enumerate(shape) if k != axis)
     limits.require(width_px, height_px)

@@ -24,6 +24,8 @@ ABSENT = (
 SAFE_METHODS = ("RICE_1", "RICE_ONE", "GZIP_1", "GZIP_2", "NOCOMPRESS")
 """FITS compression methods with safe decoders; HCOMPRESS_1's writes beyond its memory."""
 COLOURS = 3
+LEAST_UNEQUAL, MOST_UNEQUAL = 0.002, 8.0
+"""Least difference of the ratio of a pixel's sides from 1, and largest ratio."""
 MAX_NAMED = 8
 
 
@@ -52,7 +54,23 @@ def read_fits(file: BoundedFile, limits: FrameLimits, digest: str) -> Frame:
         no_time=f"the file has no time of exposure: {timing.reason}",
         orientation=orientation,
         remarks=remarks,
+        pixel_ratio=_pixel_ratio(header.behind(primary)),
     )
+
+
+def _pixel_ratio(header: fits_header.Header) -> float | None:
+    """The width of a pixel over its height by its sizes, or else by its binning; None if equal."""
+    for keys in (("XPIXSZ", "YPIXSZ"), ("PIXSIZE1", "PIXSIZE2"), ("XBINNING", "YBINNING")):
+        sides = [header.cards.get(key) for key in keys]
+        width, height = (
+            0.0 if each is None or isinstance(each, (bool, str)) else float(each) for each in sides
+        )
+        if min(width, height) <= 0.0:
+            continue
+        ratio = width / height
+        if abs(ratio - 1.0) > LEAST_UNEQUAL and 1.0 / MOST_UNEQUAL <= ratio <= MOST_UNEQUAL:
+            return ratio
+    return None
 
 
 def write_fits(

@@ -29,6 +29,15 @@ TIMES_OF_DAY = ("TIME-OBS", "UT")
 """FITS keywords of a time of day that completes a date without one."""
 UTC_OFFSETS = ("UTCOFFS", "UTC-OFFS", "UTCOFF", "UTC-OFF", "UTCOFFSE", "UTC_OFFS")
 """FITS keywords of the hours by which a header's local time is ahead of UTC."""
+ZONES = (*UTC_OFFSETS, "TIMEZONE", "TZ")
+LOCAL_CLOCKS = ("LT", "LT-OBS", "LOCTIME", "LOCALTIM", "LTIME", "DATE-LOC")
+"""FITS keywords of the local time at the start of an exposure."""
+JULIAN_DATES = ("JD", "JD-OBS", "JD_UTC", "MJD")
+"""FITS keywords of a Julian date outside the standard, compared with the date alone."""
+JULIAN_SAME_S = 2.0
+"""Error in seconds of a Julian date with five decimals."""
+STACKED = ("STACKCNT", "NCOMBINE", "SNAPSHOT")
+"""FITS keywords of the number of exposures that were combined to a picture."""
 LONGEST_EXPOSURE_S = 3600.0
 SAME_S = 1.0
 """Largest difference, in seconds, between two times for the same moment of an exposure."""
@@ -79,6 +88,7 @@ _LOCAL = re.compile(
 _IS_UTC = re.compile(r"\b(UTC|UT|GMT|universal)\b", re.IGNORECASE)
 _ZONE = re.compile(r"\b(?:UTC|UT|GMT)\s*([+-])\s*(\d{1,2})(?::?([0-5]\d))?(?![\d-])")
 _SCALE_WORDS = re.compile(r"\b(TAI|TT|TDT|TDB|GPS)\b")
+_OTHER_CENTRE = re.compile(r"(?i)helio|bary|\bend\b|written|saved")
 _OTHER_SIGN = re.compile(r"\b(add|added|minus|subtract|to utc|to ut)\b")
 
 
@@ -236,6 +246,7 @@ class _DateCards:
         middle, start, end = _agreed(averages), _agreed(starts), _agreed(ends)
         if "DATE-OBS" in starts:
             self._require_same_clock()
+            self._require_same_dates(starts["DATE-OBS"])
         lasted_s = None if start is None or end is None else _seconds_between(start, end)
         if lasted_s is not None and not -0.001 <= lasted_s <= LONGEST_EXPOSURE_S:
             raise _NoTime(f"start and end of the exposure lie {lasted_s:.3f} s apart")
@@ -255,6 +266,7 @@ class _DateCards:
             if late or early:
                 raise _NoTime("the average time is not between start and end")
             return middle, f"{next(iter(averages))} (middle of the exposure)"
+        self._require_one_exposure(lasted_s)
         begun = f"{next(iter(starts), '')} (start of the exposure)"
         ended, lasted = f"{next(iter(ends), '')} (end of the exposure)", self.exposure.source
         if start is not None and exposure_s is not None:
@@ -288,6 +300,34 @@ class _DateCards:
             late_s = _seconds_between(start, other)
             if not -SAME_S <= late_s <= (self.exposure.seconds or 0.0) + SAME_S:
                 raise _NoTime(f"DATE-OBS is {date.strip()[:30]}, and {key} {clock[:30]}")
+
+    def _require_same_dates(self, start: Utc) -> None:
+        """Raise `_NoTime` if a Julian date or the local time contradicts the start of exposure."""
+        header, shown = self.header, str(self.header.cards["DATE-OBS"]).strip()[:30]
+        for key in JULIAN_DATES:
+            value = header.cards.get(key)
+            if isinstance(value, bool) or not isinstance(value, (int, float)):
+                continue
+            days = float(value) - (2_400_000.5 if value > 1e6 else 0.0)
+            if not 41317.0 <= days <= 88069.0 or _OTHER_CENTRE.search(header.comments.get(key, "")):
+                continue
+            other = _converted(2400000.5 + int(days), days - int(days), self._scale("DATE-OBS"))
+            late_s = _seconds_between(start, other)
+            if not -JULIAN_SAME_S <= late_s <= (self.exposure.seconds or 0.0) + JULIAN_SAME_S:
+                raise _NoTime(f"DATE-OBS is {shown}, and {key} {value} is {late_s:.0f} s later")
+        zones = [self.common.cards.get(key) for key in ZONES]
+        is_apart = any(isinstance(each, (int, float)) and each for each in zones)
+        for key in LOCAL_CLOCKS if is_apart else ():
+            clock = header.cards.get(key)
+            if isinstance(clock, str) and clock.strip()[-8:] == shown[11:19]:
+                raise _NoTime(f"DATE-OBS is {shown}, the local time of {key}")
+
+    def _require_one_exposure(self, lasted_s: float | None) -> None:
+        """Raise `_NoTime` for a stack of exposures whose end is not stated."""
+        for key in STACKED if lasted_s is None else ():
+            count = self.header.cards.get(key)
+            if isinstance(count, (int, float)) and count > 1:
+                raise _NoTime(f"it is a stack of {count:g} exposures ({key}) without DATE-END")
 
     def _missing(self, moment: Utc | None) -> str:
         problems = "".join(f"; {each}" for each in (*self.problems, self.exposure.problem) if each)

@@ -40,6 +40,8 @@ class Frame:
     is_mirrored: bool = False
     """True if only the mirrored image matches the sky; `counts` are mirrored then."""
     remarks: tuple[str, ...] = ()
+    pixel_ratio: float | None = None
+    """The width of a pixel over its height, if the file or its sender states it."""
 
     @property
     def is_turned(self) -> bool:

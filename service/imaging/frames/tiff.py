@@ -56,6 +56,10 @@ logging.getLogger("tifffile").setLevel(logging.CRITICAL)
 """Silence tifffile's logger: this module reports the faults of files as errors."""
 
 
+_OPACITY = {1, 2}
+"""Kinds of extra samples that are opacity (TIFF 6.0, ExtraSamples)."""
+
+
 def read_tiff(file: BoundedFile, limits: FrameLimits, digest: str) -> Frame:
     """The frame in a TIFF file; raises `BadFile` with the reason if it cannot be read.
 
@@ -86,6 +90,9 @@ def read_tiff(file: BoundedFile, limits: FrameLimits, digest: str) -> Frame:
             stored, full_scale = _light(page, file)
             counts, orientation = as_shown(as_counts(stored), tag)
     limits.require(counts.shape[1], counts.shape[0])
+    if page.samplesperpixel == 2 and not set(page.extrasamples) & _OPACITY:
+        unnamed = "image: the first of two samples a pixel was taken; the other has no name"
+        remarks = (*remarks, unnamed)
     return Frame(
         *(counts, "TIFF", digest, full_scale, time, exposure_s),
         orientation=orientation,

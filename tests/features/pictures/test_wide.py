@@ -1,5 +1,6 @@
 """Pictures of very wide lenses, and of pixels that are not square, of which nothing is told."""
 
+import io
 import math
 from dataclasses import replace
 
@@ -11,7 +12,9 @@ from service.acquire.picture import solve_picture
 from service.cli import main
 from service.identify.blind.lens import PARAMETERS, PROJECTIONS, Lens, lens_of, linearised
 from service.identify.blind.solver import focal_px_of
-from service.imaging.frames.frame import Frame
+from service.imaging.frames.files import read_frame
+from service.imaging.frames.fits import write_fits
+from service.imaging.frames.frame import Frame, FrameLimits
 from service.vectors import attitude_error_arcsec, rotate_about
 from tests.features.pictures.trailed import add_path
 from tests.scale import draws
@@ -128,6 +131,40 @@ def test_places_and_directions_of_a_projection_are_each_other_s(projection, rng)
 def test_pixels_binned_along_one_side_only_are_solved(blind, stretch):
     frame, attitude = drawn(blind[0], "gnomonic", 40, 6.0, 6, stretch)
     assert_right(solve_picture(frame, *blind), attitude, "unequal_pixels: ")
+
+
+@pytest.mark.parametrize("stretch", [(1.3, 1.0), (1.0, 0.7)])
+def test_pixels_of_any_stated_ratio_are_solved(blind, stretch):
+    """Wider or higher by a share that no averaging of pairs makes square."""
+    frame, attitude = drawn(blind[0], "gnomonic", 40, 6.0, 6, stretch)
+    told = replace(frame, pixel_ratio=stretch[1] / stretch[0])
+    guess_px = focal_px_of(WIDTH, 40.0)
+    assert_right(solve_picture(told, *blind, guess_px), attitude, "unequal_pixels: ")
+
+
+def test_a_wrong_ratio_of_a_header_does_no_harm(blind):
+    frame, attitude = drawn(blind[0], "gnomonic", 40, 6.0, 6)
+    found = solve_picture(replace(frame, pixel_ratio=1.5), *blind)
+    assert not any(each.startswith("unequal_pixels") for each in found.remarks)
+    assert attitude_error_arcsec(found.attitude.attitude, attitude).max() < 60.0
+
+
+@pytest.mark.parametrize(
+    ("cards", "ratio"),
+    [
+        ({"XPIXSZ": 9.0, "YPIXSZ": 4.5}, 2.0),
+        ({"XBINNING": 1, "YBINNING": 2, "XPIXSZ": 5.0, "YPIXSZ": 5.0}, 0.5),
+        ({"XPIXSZ": 5.0, "YPIXSZ": 5.0}, None),
+        ({"XPIXSZ": 0.0, "YPIXSZ": 5.0}, None),
+        ({"XPIXSZ": "wide", "YPIXSZ": 5.0, "XBINNING": True, "YBINNING": 2}, None),
+    ],
+)
+def test_the_ratio_of_pixel_sides_is_read_from_a_header(cards, ratio):
+    file = io.BytesIO()
+    counts = np.arange(480, dtype=np.uint16).reshape(20, 24)
+    write_fits(file, counts, cards)
+    file.seek(0)
+    assert read_frame(file, FrameLimits(1_000)).pixel_ratio == ratio
 
 
 def test_clear_points_that_are_no_sky_get_a_plain_sentence(blind):
