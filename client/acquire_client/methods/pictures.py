@@ -18,6 +18,7 @@ class PicturesMethods:
         spacecraft: str | None = None,
         field_of_view_deg: float | None = None,
         lens: str | None = None,
+        pixel_ratio: float | None = None,
         image: str | None = None,
         overlay: bool = False,
     ) -> Call[models.Picture]:
@@ -28,6 +29,7 @@ class PicturesMethods:
         - `field_of_view_deg`: Along the longer side; may be wrong by a quarter. From 120: with
           `lens`.
         - `lens`: How the lens projects the sky. Default: whatever fits.
+        - `pixel_ratio`: Width of a pixel over its height. Default: from the FITS header, else 1.
         - `image`: As of a frame.
         - `overlay`: Whether the answer holds the picture with the stars.
         """
@@ -36,6 +38,7 @@ class PicturesMethods:
             "spacecraft": spacecraft,
             "field_of_view_deg": field_of_view_deg,
             "lens": lens,
+            "pixel_ratio": pixel_ratio,
             "image": image,
             "overlay": overlay,
         }
