@@ -130,6 +130,18 @@ def test_a_mirrored_field_is_not_called_good_and_the_answer_names_the_mirror(vie
     assert told
 
 
+def test_three_stars_that_fit_better_in_a_mirror_suggest_no_mirrored_sensor(views):
+    """Three stars fit a mirror by chance at times; a mirrored sensor shows in larger fields."""
+    drawn = views("SOHO", 3)
+    fitted = 0
+    for _ in range(8 * BATCHES):
+        group = drawn.mirrored(3)
+        found = acquired(drawn, drawn.batch(group, prior=drawn.prior(group.attitude))[0])
+        assert not any(text.startswith("mirrored_field: ") for text in found.warnings)
+        fitted += found.trackers[0].identification.mirrored
+    assert fitted
+
+
 @pytest.mark.parametrize("points", [2, 3, 5, 8])
 def test_points_that_are_no_stars_give_no_good_attitude(views, points):
     drawn = views("XTE", points)

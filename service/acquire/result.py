@@ -320,6 +320,15 @@ def warning_of_rival(rival: RivalAttitude) -> str:
     )
 
 
+FEWEST_IN_A_MIRROR = 4
+"""Least number of stars whose better fit in a mirror is no chance; three fit one at times."""
+
+
+def is_mirrored(identification: Identification) -> bool:
+    """True if the mirror image of a tracker's stars fits the sky better, beyond chance."""
+    return identification.mirrored and len(identification.outcome) >= FEWEST_IN_A_MIRROR
+
+
 def warnings_of_trackers(trackers: Iterable[TrackerResult], attitude: Matrix) -> list[str]:
     """Warnings about each tracker's identification, at the solved or presumed attitude."""
     warnings = []
@@ -332,10 +341,10 @@ def warnings_of_trackers(trackers: Iterable[TrackerResult], attitude: Matrix) ->
                 f"field_of_view_past_zone_edge: the field of view of {tracker.name} reaches past "
                 "the edge of its zone; stars beyond it cannot be identified"
             )
-        if each.identification.mirrored:
+        if is_mirrored(each.identification):
             warnings.append(
-                f"mirrored_field: the stars of {tracker.name} fit better in a mirror: one of its "
-                "axes may have the wrong sign, or two are exchanged"
+                f"mirrored_field: the stars of {tracker.name} fit better in a mirror; if every "
+                "batch says so, one of its axes has the wrong sign, or two are exchanged"
             )
         if each.identification.bounded:
             warnings.append(

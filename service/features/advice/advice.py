@@ -14,6 +14,7 @@ import numpy as np
 from msgspec import structs
 
 from service.acquire import Acquisition
+from service.acquire.result import is_mirrored
 from service.errors import BadInput
 from service.features.advice import trackers
 from service.features.advice.evidence import evidence_of, merged
@@ -233,9 +234,9 @@ def advise(
             sure = tuple(each.identification for each in acquisition.trackers)
             sample.cases.append((batch, sure, trial_counts(acquisition, sure)))
             sample.with_rival += acquisition.rival is not None
-            if any(each.mirrored for each in sure):
+            if any(map(is_mirrored, sure)):
                 freely = run_freely(verified.of(batch)).trackers
-                sample.mirrored += any(each.identification.mirrored for each in freely)
+                sample.mirrored += any(is_mirrored(each.identification) for each in freely)
         pace.step()
     evidence = merged(parts)
     uses_voting = any(

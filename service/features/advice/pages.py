@@ -12,6 +12,7 @@ from starlette.responses import Response
 from service.features.advice.part import AdviceService, best_setting, no_changes_text
 from service.features.advice.routes import ADVICE_LIMIT_S, MAX_SAMPLE, AdviceQuery
 from service.missions.mission import Tolerances
+from service.web.console.options import SYMBOLS
 from service.web.console.page import ContextDep, FromQuery, PageContext, Panel, console_page
 from service.web.console.pages.spacecraft_page import PeriodBefore, ShownPeriod
 from service.web.requests.access import Policy
@@ -32,11 +33,19 @@ class AdviceForm(AdviceQuery):
         return filled
 
 
+_SYMBOLS = {**SYMBOLS, "zone.radius_deg": "CCAP", "zone.half_width_deg": "WBAND"}
+_NAMED = re.compile(rf"\b({'|'.join(map(re.escape, _SYMBOLS))})\b")
+
+
 def with_settings(text: str) -> Markup:
     """Mark up setting names in a sentence, with the symbols of Fink & Shoup as tooltips."""
-    named = re.compile(r"\b([A-Z0-9]+) \(([a-z_.]+)\)")
-    marked = named.sub(r'<abbr title="\1 in Fink &amp; Shoup (1994)">\2</abbr>', str(escape(text)))
-    return Markup(marked.replace(" (NTOT)", ""))
+    marked = _NAMED.sub(
+        lambda found: (
+            f'<abbr title="{_SYMBOLS[found[0]]} in Fink &amp; Shoup (1994)">{found[0]}</abbr>'
+        ),
+        str(escape(text)),
+    )
+    return Markup(marked)
 
 
 @console_page("/advice/{name}", "Advice", Policy("read", "path"), section="/")

@@ -5,6 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from scipy.special import bdtrc
+
 from service.features.advice.advice import ALL_RECOMMENDED, PRESENT, Findings, VariantOutcome
 from service.features.advice.tolerances import (
     KEPT,
@@ -16,11 +18,13 @@ from service.features.advice.trackers import AlignmentFinding, MagnitudeFinding,
 from service.features.advice.zone_size import LEAST_BATCHES as LEAST_BATCHES_OF_ZONES
 from service.features.advice.zone_size import ZoneCost, ZoneSize
 from service.intervals import Interval
-from service.missions.mission import Band, Mission
+from service.missions.mission import Mission
 
 Action = Literal["widen", "tighten", "keep", "correct", "wait"]
 _APRIORI = ("cross_product_deg", "pole_difference_deg", "pole_angle_deg")
 """Tolerances that bound errors of the a priori attitude, not of the tracker."""
+MIRRORED_BY_CHANCE, CERTAIN = 0.02, 0.001
+"""Share of batches whose stars fit a mirror by chance, and the greatest chance that is none."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +62,9 @@ def group_statements(advice: Findings) -> list[Statement]:
                 "the tracker, or for a slew while the stars of a batch were observed.",
             )
         )
-    if advice.mirrored:
+    # k or more of n batches by chance alone: the tail of a binomial distribution.
+    by_chance = bdtrc(advice.mirrored - 1, advice.sampled, MIRRORED_BY_CHANCE)
+    if advice.mirrored and by_chance < CERTAIN:
         statements.append(
             Statement(
                 "correct",
@@ -74,7 +80,7 @@ def tolerance_statement(finding: ToleranceFinding, advice: Findings) -> Statemen
     """Sentence and action for one tolerance."""
     name, unit = finding.tolerance.name, finding.tolerance.unit
     now = _quantity(finding.now, unit)
-    start = f"{finding.symbol} ({name})"
+    start = name
     if finding.verdict == "not_used":
         return Statement("keep", f"{start}: its test is off, so it has no effect.")
     if not advice.uses_voting:
@@ -125,7 +131,7 @@ def tolerance_statement(finding: ToleranceFinding, advice: Findings) -> Statemen
 
 def _change_statement(action: Action, text: str, finding: ToleranceFinding) -> Statement:
     line = f"{finding.tolerance.name} = {finding.recommended:g}"
-    change = FileChange("tolerances", None, f"{line:<32} # {finding.symbol}, was {finding.now:g}")
+    change = FileChange("tolerances", None, f"{line:<32} # was {finding.now:g}")
     return Statement(action, text, (change,))
 
 
@@ -342,16 +348,15 @@ WIDER, NARROWER = 1.05, 0.5
 
 
 def zone_statements(mission: Mission, size: ZoneSize, costs: Sequence[ZoneCost]) -> list[Statement]:
-    """Sentences on zone size (CCAP or WBAND) from recorded a priori errors, and on HMAX.
+    """Sentences on zone size from recorded a priori errors, and on the separation of pairs.
 
     `costs` belong to `size.sizes_deg`.
     """
-    return [_size_statement(mission, size, costs), _hmax_statement(mission, size)]
+    return [_size_statement(size, costs), _pair_separation_statement(mission, size)]
 
 
-def _size_statement(mission: Mission, size: ZoneSize, costs: Sequence[ZoneCost]) -> Statement:
-    symbol = "WBAND" if isinstance(mission.zone, Band) else "CCAP"
-    start = f"{symbol} ({size.setting})"
+def _size_statement(size: ZoneSize, costs: Sequence[ZoneCost]) -> Statement:
+    start = size.setting
     room = (
         f"{size.size_deg:g}° leaves room for an a priori error of {size.margin_deg:.2f}° about the "
         f"field of view of {size.field_of_view_deg:g}°"
@@ -375,7 +380,7 @@ def _size_statement(mission: Mission, size: ZoneSize, costs: Sequence[ZoneCost])
         )
     change = f"{size.setting} = {size.covering_deg:g}"
     line = f"{size.setting.removeprefix('zone.')} = {size.covering_deg:g}"
-    lines = (FileChange("zone", None, f"{line:<32} # {symbol}, was {size.size_deg:g}"),)
+    lines = (FileChange("zone", None, f"{line:<32} # was {size.size_deg:g}"),)
     if size.verdict == "fits":
         return Statement("keep", f"{start} fits: {room}, and {seen}.{gross}")
     if size.verdict == "too_small":
@@ -399,14 +404,14 @@ def _cost(size: ZoneSize, costs: Sequence[ZoneCost]) -> str:
     if size.covering_deg is None or len(pairs) < 2:
         return ""
     then, now = pairs[size.covering_deg], pairs[size.size_deg]
-    return f" The richest zone of the sky then holds {then:,} pairs (NTOT) instead of {now:,}."
+    return f" The richest zone of the sky then holds {then:,} pairs instead of {now:,}."
 
 
-def _hmax_statement(mission: Mission, size: ZoneSize) -> Statement:
+def _pair_separation_statement(mission: Mission, size: ZoneSize) -> Statement:
     limit_deg = mission.tolerances.pair_separation_max_deg
     wide_deg = 2.0 * size.field_of_view_deg
-    start = "HMAX (pair_separation_max_deg)"
-    line = f"{f'pair_separation_max_deg = {wide_deg:g}':<32} # HMAX, was {limit_deg:g}"
+    start = "pair_separation_max_deg"
+    line = f"{f'pair_separation_max_deg = {wide_deg:g}':<32} # was {limit_deg:g}"
     lines = (FileChange("tolerances", None, line),)
     if limit_deg > WIDER * wide_deg:
         return Statement(

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,11 @@ from scipy import stats
 from service.acquire import acquire
 from service.features.advice.advice import WorkLimit
 from service.features.advice.part import advice_record
-from service.features.advice.statements import alignment_statement, noise_statement
+from service.features.advice.statements import (
+    alignment_statement,
+    group_statements,
+    noise_statement,
+)
 from service.features.advice.text import advice_text
 from service.features.advice.tolerances import rounded_up, tolerance_findings
 from service.features.advice.trackers import alignment_findings, magnitude_findings, noise_findings
@@ -410,6 +415,21 @@ def test_a_batch_that_no_longer_fits_is_counted_and_passed_by(sky, missions, see
     assert "sun_pointed" in advice.refusal
 
 
+def test_a_mirrored_sensor_is_suggested_only_beyond_chance(sky, missions, seed):
+    mission = missions["XTE"]
+    advice = advice_from(mission, sky, flown(mission, sky, 5, seed).batches)
+    assert group_statements(advice) == []
+    for mirrored, sampled, is_told in (
+        (1, 1, False),
+        (1, 300, False),
+        (6, 300, False),
+        (3, 3, True),
+        (250, 300, True),
+    ):
+        found = replace(advice, mirrored=mirrored, sampled=sampled)
+        assert bool(group_statements(found)) is is_told
+
+
 def test_where_time_runs_out_fewer_batches_are_looked_at_and_the_answer_says_so(
     sky, missions, seed
 ):
@@ -429,7 +449,7 @@ def test_the_text_can_be_acted_upon(sky, seed):
     advice = advice_from(mission, sky, pass_.batches)
     text = advice_text(record_of(advice, 99))
     assert "60 of 99 batches were examined." in text
-    assert "SEPTOL (separation_deg) is too tight" in text
+    assert "separation_deg is too tight" in text
     changes = text.partition("To change in the mission file of XTE:")[2].splitlines()
     assert "  [tolerances]" in changes
     (line,) = [each.strip() for each in changes if each.strip().startswith("separation_deg")]
