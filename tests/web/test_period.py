@@ -6,6 +6,7 @@ A spacecraft with two trackers, of which the second becomes noisy and recovers.
 import html
 import json
 import re
+from urllib.parse import parse_qs
 
 import httpx
 import pytest
@@ -151,6 +152,18 @@ def test_a_period_shows_who_was_noisy_then_and_that_all_was_well_before(address)
     assert "20 batches, all of this period" in text_of(before)
 
 
+def test_each_link_of_an_alarm_to_a_period_covers_the_alarm_from_its_raise_to_its_return(address):
+    with httpx.Client(base_url=address, timeout=120) as client:
+        for alarm in client.get("/api/v1/alarms", params={"state": "all"}).json()["items"]:
+            page = html.unescape(client.get(f"/alarms/{alarm['id']}").text)
+            links = re.findall(r'href="/(?:spacecraft|advice)/XTE[^"]*\?([^"#]*start=[^"#]*)', page)
+            assert len(links) == 3
+            for asked in map(parse_qs, links):
+                times = [alarm[name]["time"] for name in ("raised", "worst")]
+                assert asked["start"][0] < min(times)
+                assert max(times) < asked["end"][0]
+
+
 def test_the_advice_for_an_alarm_tells_how_noisy_the_tracker_was_though_it_has_recovered(address):
     with httpx.Client(base_url=address, timeout=120) as client:
         alarms = client.get("/api/v1/alarms", params={"state": "all"}).json()["items"]
@@ -160,7 +173,7 @@ def test_the_advice_for_an_alarm_tells_how_noisy_the_tracker_was_though_it_has_r
             if (each["tracker"], each["quantity"]) == (SECOND, "residual_ratio")
         ]
         page = client.get(f"/alarms/{own}").text
-        (link,) = re.findall(r'href="/advice/XTE([^"]*)">advice for that time', page)
+        (link,) = re.findall(r'href="/advice/XTE([^"]*)">advice for its time', page)
         query = html.unescape(link)
         (said,) = re.findall(f"Noise of {SECOND} is [^<]*", client.get(f"/advice/XTE{query}").text)
         advice = client.get(f"/api/v1/spacecraft/XTE/advice{query}").raise_for_status().json()

@@ -58,8 +58,8 @@ GROUPINGS: dict[Grouping, str] = {
     "quantity": "one quantity, one usual cause",
     "spacecraft": "one spacecraft",
 }
-BEFORE_S, AFTER_S = 1800.0, 1800.0
-"""Seconds before and after the raise of an alarm that links from its page select."""
+MARGIN_S = 1800.0
+"""Seconds before and after the times out of limits, in the period of links from an alarm's page."""
 TREND_BEFORE_S = 4 * 3600.0
 TOGETHER_S = 1800.0
 """Seconds within which alarms that leave their limits are assumed to share a cause."""
@@ -154,7 +154,7 @@ def _found(context: PageContext, query: AlarmsQuery) -> tuple[list[Alarm], str |
 def _matches(alarm: Alarm, query: AlarmsQuery) -> bool:
     if query.spacecraft not in ("", alarm.spacecraft):
         return False
-    if query.severity not in ("", alarm.severity):
+    if query.severity not in ("", alarm.current_severity or alarm.severity):
         return False
     match query.state:
         case "open":
@@ -221,9 +221,6 @@ def alarm_page(id: str, query: FromQuery[AlarmQuery], context: ContextDep) -> Re
     if not context.caller.may_see(alarm.spacecraft):
         # Same answer as for an unknown id: probing must not reveal alarms of other spacecraft.
         raise NotFound(f"there is no alarm with the id {shown_value(id)}")
-    raised = recorded_utc(alarm.raised.time)
-    around = {"start": shifted(raised, -BEFORE_S).text, "end": shifted(raised, AFTER_S).text}
-    of_tracker = {"tracker": alarm.tracker} if _has_tracker(context, alarm) else {}
     is_retired = context.app.part(Alarms).is_retired(alarm.spacecraft, alarm.tracker)
     (times,) = context.app.part(Alarms).times_out([alarm])
     return context.rendered(
@@ -235,9 +232,11 @@ def alarm_page(id: str, query: FromQuery[AlarmQuery], context: ContextDep) -> Re
         cause=quantity_named(alarm.quantity).cause,
         related=_related(context, alarm),
         trend=_trend(context, alarm),
-        around=around,
-        trends_around=around | of_tracker,
-        since={"start": around["start"], "end": _end(alarm).text, **of_tracker},
+        period={
+            "start": shifted(recorded_utc(alarm.raised.time), -MARGIN_S).text,
+            "end": shifted(recorded_utc(times[-1][1] or alarm.latest.time), MARGIN_S).text,
+        },
+        of_tracker={"tracker": alarm.tracker} if _has_tracker(context, alarm) else {},
     )
 
 
@@ -249,7 +248,7 @@ def _has_tracker(context: PageContext, alarm: Alarm) -> bool:
 
 def _end(alarm: Alarm) -> Utc:
     """End of the period shown for an alarm: after its raise and its latest batch."""
-    after = shifted(recorded_utc(alarm.raised.time), AFTER_S)
+    after = shifted(recorded_utc(alarm.raised.time), MARGIN_S)
     # The end of the period is excluded, so it lies after the latest batch.
     latest = second_after(alarm.latest.time)
     return max(after, latest, key=lambda moment: moment.tai_ns)

@@ -100,6 +100,34 @@ def test_alarms_are_filtered_sorted_and_grouped(fleet_client):
     assert "Left limits at 1999-03-01 (060) 20:00 UTC: 6 alarms of 6 spacecraft" in text
 
 
+def test_wherever_an_alarm_is_shown_it_has_its_severity_of_now(tmp_path):
+    """Three alarms that were critical: one is a warning now, one is back in limits."""
+    app = open_app(in_process_settings(sqlite_at(tmp_path / "acquire.db")))
+    for name, current, in_limits in (
+        ("XTE", "critical", False),
+        ("SWAS", "warning", False),
+        ("SOHO", None, True),
+    ):
+        columns = {"severity": "critical", "current_severity": current}
+        fleet.put_alarm(app, name, [("raised", 0), ("left_again", 1)], in_limits, **columns)
+    with Server(create_app(app)) as address, httpx.Client(base_url=address) as client:
+        found = {each["spacecraft"]: each for each in client.get("/api/v1/alarms").json()["items"]}
+        assert {each["severity"] for each in found.values()} == {"critical"}
+        text = text_of(client.get(f"/alarms/{found['XTE']['id']}"))
+        related = text[text.index("may have the same cause") : text.index("Times out of limits")]
+        assert re.search("warning SWAS", related.replace("▲", ""))
+        assert "● back in limits SOHO" in related
+        assert "critical" not in related
+        for name, now in (("SWAS", "warning"), ("SOHO", "● back in limits")):
+            strip = text_of(client.get(f"/alarms/{found[name]['id']}")).replace("▲ ", "")
+            assert f"now {now}" in strip
+            assert "worst so far ◆ critical" in strip
+        assert re.findall(
+            r'data-name="spacecraft"><a href="/spacecraft/([\w-]+)"',
+            client.get("/alarms", params={"severity": "critical"}).text,
+        ) == ["XTE"]
+
+
 def test_an_alarm_that_went_out_again_shows_the_last_time_and_how_often(tmp_path):
     app = open_app(in_process_settings(sqlite_at(tmp_path / "acquire.db")))
     fleet.put_alarm(
