@@ -223,6 +223,39 @@ def test_a_cancelled_replay_ends_long_before_its_end_and_keeps_what_it_recorded(
     assert (again.status_code, again.json()) == (200, state)
 
 
+def test_a_cancelled_replay_says_how_it_goes_on_and_then_that_it_was_continued(
+    client, batch, run, running
+):
+    """The list of replays has the control for that in the row: cancel, then to continue."""
+    page = running.removeprefix(API)
+
+    def row():
+        listed = client.get("/runs").text.split("<tr>")
+        return next(each for each in listed if f'href="{page}"' in each)
+
+    for each in (row(), client.get(page).text):
+        assert f'data-send="DELETE {running}"' in each
+    client.delete(running)
+    for each in (row(), client.get(page).text):
+        assert f'<a href="/runs#into={run}">send the file again</a>.' in each
+        assert "data-send" not in each.partition("data-region>")[2]
+    later = begun(client, run, many(batch, run, 2_000))
+    for each in (row(), client.get(page).text):
+        assert f'<a href="{later.removeprefix(API)}">continued ' in each
+        assert "send the file again" not in each
+    client.delete(later)
+
+
+def test_a_replay_is_listed_by_the_name_of_its_file(client, batch, run):
+    asked = {"run": run, "name": "pass 7.ndjson"}
+    head = {"Content-Type": "application/x-ndjson"}
+    sent = client.post(f"{API}/replays", params=asked, content=many(batch, run, 1), headers=head)
+    assert sent.json()["name"] == "pass 7.ndjson"
+    assert ">pass 7.ndjson</a>" in client.get("/runs").text
+    refused = client.post(f"{API}/replays", params=asked | {"name": ""}, content=b"", headers=head)
+    assert [each["field"] for each in refused.json()["errors"]] == ["name"]
+
+
 def test_what_listens_for_events_is_told_of_a_cancelled_replay(client, address, running, run):
     # From the first event on: what comes between the head of the answer and its first line counts.
     everything = {"Last-Event-ID": "0"}

@@ -5,7 +5,7 @@ from functools import partial
 from typing import Annotated
 
 from fastapi import Depends, Path
-from pydantic import Field, StrictBool
+from pydantic import AfterValidator, Field, StrictBool
 from starlette.requests import Request
 from starlette.responses import Response
 
@@ -24,7 +24,7 @@ from service.web.requests.access import (
     json_response,
     require_all_spacecraft,
 )
-from service.web.requests.query_parameters import FromQuery, Query
+from service.web.requests.query_parameters import FromQuery, Query, without_nul
 
 router = ApiRouter("runs and replays")
 
@@ -64,6 +64,11 @@ class _ReplayQuery(Query):
     run: Annotated[
         RunName, Field(description="The run for every batch, in place of the batch's own.")
     ]
+    name: Annotated[
+        str | None,
+        Field(min_length=1, max_length=200, description="The file's name; without it the run's."),
+        AfterValidator(without_nul),
+    ] = None
     alarms: Annotated[bool, Field(description="Raise alarms for the run.")] = False
     spacecraft: Annotated[
         Key | None,
@@ -188,7 +193,7 @@ def start_replay(
         body.file,
         form,
         query.run,
-        name=query.run,
+        name=query.name or query.run,
         total=body.lines,
         caller=change.caller,
         alarms=query.alarms,

@@ -12,7 +12,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from service.app.runs import MOST_COMPARED
-from service.contract.runs import Comparison, RefusedLine, RunComparison
+from service.contract.runs import Comparison, RefusedLine, Replay, RunComparison
 from service.errors import BadBatch
 from service.observations.schema import Key, OptionsIn, RunName
 from service.times import DAY_S, recorded_utc, unix_seconds, utc_now
@@ -154,12 +154,14 @@ def runs_page(query: FromQuery[PageQuery], context: ContextDep) -> Response:
     A token that is bound to spacecraft sees their runs, and the replays into these runs.
     """
     bound = context.caller.spacecraft is not None
+    replays = context.app.replays.all(context.caller.spacecraft)
     return context.rendered(
         "runs.html.jinja",
         query.run,
         runs=context.app.runs.all(context.caller.spacecraft),
         reprocessings=[] if bound else context.app.runs.reprocessings(),
-        replays=context.app.replays.all(context.caller.spacecraft),
+        replays=replays,
+        later=_later(replays),
         bound=bound,
         now=utc_now(),
     )
@@ -169,12 +171,27 @@ def runs_page(query: FromQuery[PageQuery], context: ContextDep) -> Response:
 def replay_page(id: str, query: FromQuery[PageQuery], context: ContextDep) -> Response:
     """Page of one replay: its progress, and each fault of lines with its count."""
     replay = context.app.replays.get(id)
+    later = _later(context.app.replays.all(context.caller.spacecraft))
     alike: dict[str, list[RefusedLine]] = {}
     for each in replay.errors:
         # Numbers differ from line to line: of messages alike in words the first is shown.
         alike.setdefault(_NUMBER.sub("0", each.problem.detail), []).append(each)
     faults = [(each[0].line, len(each), each[0].problem.detail) for each in alike.values()]
-    return context.rendered("replay.html.jinja", query.run, replay=replay, faults=faults)
+    return context.rendered(
+        "replay.html.jinja", query.run, replay=replay, faults=faults, later=later
+    )
+
+
+def _later(replays: Sequence[Replay]) -> dict[str, Replay]:
+    """For each replay, newest first, the next replay of the same file into the same run."""
+    newest: dict[tuple[str, str], Replay] = {}
+    later = {}
+    for each in replays:
+        key = each.run, each.name
+        if key in newest:
+            later[each.id] = newest[key]
+        newest[key] = each
+    return later
 
 
 _NUMBER = re.compile(r"[-+\d.]*\d")
