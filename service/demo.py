@@ -80,6 +80,8 @@ def run_demo(
     if settings.port == 0:
         raise BadInput(Fault("--port", "must be a port that can be named", "0"))
     folder.mkdir(parents=True, exist_ok=True)
+    unused = "" if settings.database == Settings.database else f"; {PREFIX}DATABASE is not used"
+    print(f"samples, answers and database: {folder.resolve()}{unused}", file=sys.stderr, flush=True)
     # The folder's content can be made again: let git ignore it.
     (folder / ".gitignore").write_text("*\n", encoding="utf-8")
     database = folder / "acquire.db"

@@ -132,6 +132,7 @@ def assert_as_predicted(printed, folder, least_within=98.0):
 
 def test_nominal_stretches_are_identified_and_the_errors_are_as_predicted(first, capsys):
     assert first.live, first.complaints
+    assert f"samples, answers and database: {first.folder}" in first.complaints
     assert_as_predicted(first.told, first.folder)
     # The passes can be filtered with their gyros as they are.
     (words,) = re.findall(r"acquire (smooth XTE --run .*)$", first.told, re.MULTILINE)

@@ -16,7 +16,7 @@ def add(commands: Any) -> None:
         "--folder",
         type=Path,
         default=Path("var"),
-        help="folder for samples and database; default ./var",
+        help="folder for samples and database, in place of ACQUIRE_DATABASE; default ./var",
     )
     parser.add_argument(
         "--batches", type=count, default=300, metavar="N", help="batches per mission; default 300"

@@ -65,7 +65,6 @@ function facts(picture) {
     ["roll", `${attitude.roll_deg.toFixed(3)}°, of the upper edge, from north through east`],
     ["quaternion", `${attitude.quaternion.join(", ")} (ICRS to camera, scalar last)`],
     ["sigma", `${attitude.sigma_arcsec.map((each) => each.toFixed(1)).join(", ")}″ about x, y, z`],
-    ["status", `${attitude.status}: the lens was fitted on the picture itself`],
     ["aberration", attitude.aberration],
     ["field", `${width.toFixed(3)}° × ${height.toFixed(3)}°`],
     ["focal length", `${lens.focal_px.toFixed(1)} px${within(lens.focal_sigma_px, " px")}`],
@@ -110,6 +109,7 @@ function draw(name, picture) {
     ["residual, px", Math.hypot(...star.residual_px).toFixed(2)],
   ])));
   byId("more-stars").textContent = stars > MOST_ROWS ? `The ${MOST_ROWS} brightest of ${stars}; the JSON has all.` : "";
+  byId("suspect").hidden = picture.attitude.status !== "suspect";
   byId("facts").replaceChildren(...facts(picture).map(fact));
   items("remarks", picture.remarks);
   return `${stars} stars identified, ${picture.candidates} points of light.`;
