@@ -73,14 +73,17 @@ class Annotations:
             lambda connection: events.add_annotation(connection, row), entry
         )
 
-    def delete(self, id: str, entry: Entry | None = None) -> Annotation:
-        """Delete an annotation; the audit list keeps its text."""
+    def delete(
+        self, id: str, who: str, comment: str | None = None, entry: Entry | None = None
+    ) -> Annotation:
+        """Delete an annotation; the audit list keeps it, who deleted it, and the comment."""
         known = known_id(id, "annotation")
 
         def change(connection: Connection) -> Annotation:
             deleted = events.delete_annotation(connection, known)
             if entry is not None:
-                body = msgspec.json.encode(deleted).decode()
+                signed = {"who": who, "comment": comment, "deleted": deleted}
+                body = msgspec.json.encode(signed).decode()
                 dataclasses.replace(entry, body=body).add_to(connection)
             return deleted
 

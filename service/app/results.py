@@ -12,7 +12,7 @@ from msgspec import structs
 from service.access import Entry
 from service.acquire.choices import Choices, choices_of, refuse_idle_options
 from service.app.context import ALL_RUNS, Context, known_id
-from service.contract.answers import Answer, Neighbours, Result, Summary
+from service.contract.answers import Answer, Neighbours, Replacement, Result, Signature, Summary
 from service.contract.base import Page
 from service.contract.runs import Comparison
 from service.errors import Busy, NotFound
@@ -44,6 +44,8 @@ from service.storage.recording.unsaved_result import Answered
 from service.storage.sql.columns import Row
 from service.times import Utc, utc_now
 
+MOST_ADOPTED = 20
+
 
 class Results:
     """Service that reads recorded results, their charts, and their what-ifs."""
@@ -56,11 +58,34 @@ class Results:
         """Read a result with its answer and input, and the what-ifs of its batch."""
         with self._context.reading_batch(known_id(id, "batch")) as (connection, archived):
             record = results.read_record(connection, id, archived=archived)
-        if record.parent is None:
+            current = None if record.current else results.current_of(connection, id)
+        if record.parent is None and current is None:
             return record
         with self._context.reading() as connection:
-            signature = signature_of(connection, record.parent, id)
-        return structs.replace(record, signature=signature)
+            if record.parent is not None:
+                signature = signature_of(connection, record.parent, id)
+                record = structs.replace(record, signature=signature)
+            if current is not None and current.parent_id is not None:
+                replaced_by = Replacement(
+                    result=current.id,
+                    signature=signature_of(connection, current.parent_id, current.id),
+                )
+                record = structs.replace(record, replaced_by=replaced_by)
+        return record
+
+    def adopted(
+        self, spacecraft: str, run: str, start: Utc, end: Utc
+    ) -> list[tuple[Row, Signature | None]]:
+        """Adopted what-ifs of a period, the last adopted first, with their signatures.
+
+        See `results.adopted_what_ifs` for the columns; at most `MOST_ADOPTED` are read.
+        """
+        selected = ResultFilter(run, spacecraft, start, end)
+        with self._context.reading() as connection:
+            found = results.adopted_what_ifs(connection, selected, MOST_ADOPTED)
+            return [
+                (each, signature_of(connection, each["parent_id"], each["id"])) for each in found
+            ]
 
     def latest(self, spacecraft: str, run: str | None = None) -> Result:
         """Read the newest current result of a spacecraft in a run, by batch time, as `get` does.

@@ -50,7 +50,8 @@ class AuditEntry(Record, frozen=True, kw_only=True):
     id: Id
     moment: Stamp
     who: Annotated[str, doc("The token's name; `local` while access is open.")]
-    action: Annotated[str, doc("The operation's name in this description.")]
+    action: str
+    """The operation's name in this description; `adopt_what_if` if it made a what-if current."""
     about: Annotated[str, doc("Path and query of the request.")]
     body: Annotated[str | None, doc("The body of the request; of a long one, the beginning.")]
     status: Annotated[int | None, doc("Status of the answer; null for an action of a command.")]

@@ -384,6 +384,14 @@ class Signature(Record, frozen=True, kw_only=True):
     comment: str | None
 
 
+class Replacement(Record, frozen=True, kw_only=True):
+    """Adopted what-if that is current in place of another result of its batch."""
+
+    result: Id
+    signature: Signature | None
+    """Signature of its adoption; null if the audit list has none."""
+
+
 class Result(Record, frozen=True, kw_only=True):
     """A result with its batch, and the other results of that batch."""
 
@@ -400,6 +408,8 @@ class Result(Record, frozen=True, kw_only=True):
     parent: Id | None
     signature: Signature | UnsetType | None = UNSET
     """Signature on a recorded what-if; null if the audit list has none."""
+    replaced_by: Replacement | UnsetType = UNSET
+    """The adopted what-if that is current in place of this result; absent if there is none."""
     archived: Annotated[bool, doc("True if it is read from the archive, which takes longer.")]
     what_ifs: list[Summary]
     frame: FrameWithStars | UnsetType | None = UNSET

@@ -112,15 +112,18 @@ def test_a_bad_field_is_named_and_nothing_is_stored(client, change, field):
 def test_a_note_that_is_deleted_is_gone_and_the_audit_list_keeps_its_text(client, note):
     here = f"{HERE}/{note['id']}"
     assert client.delete(here).json()["errors"][0]["field"] == "who"
-    assert client.delete(f"{here}?who=mk").json() == note
+    signed = "who=mk&comment=wrong+pass"
+    assert client.delete(f"{here}?{signed}").json() == note
     assert client.delete(f"{here}?who=mk").status_code == 404
     assert client.delete(f"{HERE}/x?who=mk").status_code == 404
     assert texts(client) == []
     entries = client.get("/api/v1/audit").json()["items"]
     (deleted,) = [e for e in entries if here in e["about"] and e["status"] == 200]
     assert deleted["action"] == "delete_annotation"
-    assert deleted["about"] == f"{here}?who=mk"
+    assert deleted["about"] == f"{here}?{signed}"
     assert "Wheel 2 unloaded" in deleted["body"]
+    # The person of the entry deleted the note, which another person wrote.
+    assert (deleted["person"], deleted["reason"]) == ("mk", "wrong pass")
 
 
 def test_what_is_written_and_deleted_is_told_to_streams(client, address, note):

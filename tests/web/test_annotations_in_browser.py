@@ -51,6 +51,7 @@ def opened(browser, page, **how):
 
 
 def typed(browser, field, text):
+    browser.run("document.getElementById('add-annotation').open = true")
     browser.run(FOCUS.format(field) + "; document.activeElement.select?.()")
     browser.call("Input.insertText", text=text)
 
@@ -104,10 +105,29 @@ def test_on_a_phone_a_tap_on_a_chart_gives_the_time_and_a_note_can_be_deleted(br
     typed(browser, "who", "jb")
     browser.run("document.querySelector('#annotate .main').click()")
     browser.wait(lambda: browser.run(LISTED) == ["first line\nsecond line"])
-    browser.run("document.querySelector('[data-annotation] summary').click()")
     browser.run("document.querySelector('[data-delete]').click()")
+    # Without a reason the dialog stays, and the note as well.
+    browser.run("document.querySelector('dialog .main').click()")
+    assert browser.run("document.querySelector('dialog').open")
+    browser.run("document.querySelector('dialog [name=comment]').value = 'a trial'")
+    browser.run("document.querySelector('dialog .main').click()")
     browser.wait(lambda: browser.run(LISTED) == [])
-    assert browser.run(STATUS) == "Annotation deleted."
+    browser.wait(lambda: browser.run(STATUS) == "Annotation deleted.")
+    assert browser.complaints == []
+
+
+def test_a_note_is_added_within_the_first_screen_of_spacecraft_and_of_the_list(browser, page):
+    top = "document.querySelector('#add-annotation > summary').getBoundingClientRect().top"
+    for width, height in ((1440, 900), (400, 800)):
+        opened(browser, page, width=width, height=height)
+        assert browser.run(top) < height
+    browser.open(page.replace("/spacecraft/XTE", "/annotations?spacecraft=XTE"))
+    assert browser.run(top) < 300
+    for field, text in (("start", "1999-060 00:30"), ("text", "slew"), ("who", "jb")):
+        typed(browser, field, text)
+    browser.run("document.querySelector('#annotate .main').click()")
+    browser.wait(lambda: "slew" in browser.run("document.getElementById('list').innerText"))
+    assert faults(browser) == []
     assert browser.complaints == []
 
 

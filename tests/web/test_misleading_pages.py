@@ -297,7 +297,20 @@ def test_an_adopted_result_says_who_adopted_it_and_why(client, post, batch, run)
     assert (record["signature"]["who"], record["signature"]["comment"]) == ("A. Nyberg", "é, “why”")
     page = text_of(client.get(f"/batches/{adopted['id']}"))
     assert re.search(r"made from this result by A\. Nyberg , .* UTC, wall clock: é, “why”", page)
-    assert "signature" not in client.get(f"/api/v1/batches/{first['id']}").json()
+    former = client.get(f"/api/v1/batches/{first['id']}").json()
+    assert former["replaced_by"] == {"result": adopted["id"], "signature": record["signature"]}
+    assert "replaced_by" not in record
+    page = client.get(f"/batches/{first['id']}")
+    assert f'href="/batches/{adopted["id"]}?run={run}">an adopted one</a>' in page.text
+    assert re.search(r"adopted by A\. Nyberg , .* UTC, wall clock: é, “why”", text_of(page))
+    # It stands among the changes of its time, where no one can delete it.
+    trends = client.get("/spacecraft/XTE", params={"run": run})
+    assert f"What-if of batch {batch['batch']} adopted by A. Nyberg: é, “why”" in text_of(trends)
+    assert "data-delete" not in trends.text
+    listed = client.get("/audit", params={"about": first["id"]})
+    assert f'href="/batches/{adopted["id"]}"' in listed.text
+    assert "adopt what if" in text_of(listed)
+    assert "token local" not in text_of(listed)
     for asked, is_listed in (
         ({"person": "A. Nyberg"}, True),
         ({"action": "what_if", "about": first["id"]}, True),
@@ -314,18 +327,43 @@ def test_an_adopted_result_says_who_adopted_it_and_why(client, post, batch, run)
         assert (f"/api/v1/batches/{first['id']}/what-if" in listed) is is_listed
 
 
-def test_adopting_a_much_worse_fit_is_warned_of_with_both_figures(post, batch, run):
+def test_adopting_fewer_stars_or_a_worse_status_is_warned_of_with_both_before(post, batch, run):
+    """Also where the former result is put back."""
+    answer = answer_from_json(post(batch | {"run": run}).content)
+    counts = structs.replace(answer.counts, unique=3, ambiguous=2)
+    suspect = structs.replace(answer.attitude, status="suspect")
+    worse = structs.replace(answer, counts=counts, attitude=suspect)
+    assert adoption(answer, worse)[:2] == [
+        "▲ Fewer stars are identified: 5 to 3 of 5.",
+        "▲ The attitude is worse: good to suspect.",
+    ]
+    assert not any(each.startswith("▲") for each in adoption(worse, answer))
+
+
+def test_putting_a_worse_result_back_is_warned_of(client, post, batch, run):
+    ambiguous = {"tolerances": {"separation_deg": 0.0}, "identifier": "starid"}
+    first = post(batch | {"run": run, "options": ambiguous}).json()
+    asked = {"options": {"identifier": "verified"}, "adopt": True, "who": "jb"}
+    adopted = client.post(f"/api/v1/batches/{first['id']}/what-if", json=asked).json()
+    assert adopted["counts"]["unique"] > first["counts"]["unique"]
+    page = client.get(f"/batches/{adopted['id']}").text
+    (told,) = re.findall(r'data-changes="([^"]*)"', page)
+    stars = adopted["counts"]["unique"], first["counts"]["unique"]
+    assert f"▲ Fewer stars are identified: {stars[0]} to {stars[1]} of" in told
+
+
+def test_adopting_a_worse_fit_is_warned_of_with_both_figures(post, batch, run):
     answer = answer_from_json(post(batch | {"run": run}).content)
     attitude = answer.attitude
     assert attitude is not None
-    for new, is_warned in ((attitude.residual_rms_arcsec, False), (2991.0, True)):
+    for new, is_warned in ((attitude.residual_rms_arcsec, False), (29.0, True), (2991.0, True)):
         after = structs.replace(answer, attitude=structs.replace(attitude, residual_rms_arcsec=new))
         told = [each for each in adoption(answer, after) if each.startswith("▲")]
         assert bool(told) is is_warned
         if is_warned:
             was = arcsec(attitude.residual_rms_arcsec)
             assert told == [
-                f"▲ The new attitude fits its stars worse: residual rms {was} to 2991″."
+                f"▲ The attitude fits its stars worse: residual rms {was} to {arcsec(new)}."
             ]
     assert adoption(answer, structs.replace(answer, attitude=None))[0].startswith("▲")
 
@@ -364,6 +402,20 @@ def test_no_page_shows_a_bare_code_or_a_time_of_a_thousandth(client, full_run):
         assert not re.findall(r'value="[^"]*\.001Z"', page), address
         shown = re.sub(r"<(template|code|pre).*?</\1>|<[^>]+>", " ", page, flags=re.DOTALL)
         assert not re.findall(r"none so far|\bno_match\b|lost_in_space_refused", shown), address
+
+
+@pytest.mark.parametrize("page", ["/advice/XTE", "/advice/SOHO", "/missions", "/compare", "batch"])
+def test_the_symbols_of_the_paper_stand_in_tooltips_alone(client, full_run, page):
+    if page == "batch":
+        asked = {"run": full_run, "spacecraft": "XTE", "limit": 1}
+        (found,) = client.get("/api/v1/batches", params=asked).json()["items"]
+        page = f"/batches/{found['id']}"
+    answer = client.get(f"{page}?run={full_run}")
+    assert " in Fink &amp; Shoup (1994)" in answer.text
+    assert not re.findall(
+        r"\b(?:[CN]CAP|WBAND|NTOT|HMAX|SEPTOL|XMTOL|TMAGMX|CAPMAX|BANMAX|BANTOL\d|TASTE|k_g)\b",
+        text_of(answer),
+    )
 
 
 @pytest.mark.parametrize("text", ["lost_in_space_refused: no_match", "same_star_twice", "a: b c"])

@@ -28,6 +28,7 @@ from .answers import FrameTimings as FrameTimings
 from .answers import FrameWithStars as FrameWithStars
 from .answers import Prediction as Prediction
 from .answers import Provenance as Provenance
+from .answers import Replacement as Replacement
 from .answers import Result as Result
 from .answers import Rival as Rival
 from .answers import SearchedZone as SearchedZone

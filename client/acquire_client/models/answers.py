@@ -316,6 +316,14 @@ class Signature(Model, frozen=True, kw_only=True):
     comment: str | None
 
 
+class Replacement(Model, frozen=True, kw_only=True):
+    """Adopted what-if that is current in place of another result of its batch."""
+
+    result: str
+    signature: Signature | None
+    """Signature of its adoption; None if the audit list has none."""
+
+
 class Result(Model, frozen=True, kw_only=True):
     """A result with its batch, and the other results of that batch."""
 
@@ -331,6 +339,8 @@ class Result(Model, frozen=True, kw_only=True):
     parent: str | None
     signature: Signature | None = None
     """Signature on a recorded what-if; None if the audit list has none."""
+    replaced_by: Replacement | None = None
+    """The adopted what-if that is current in place of this result; absent if there is none."""
     archived: bool
     """True if it is read from the archive, which takes longer."""
     what_ifs: Sequence[Summary]

@@ -30,6 +30,7 @@ from service.storage.queries.pages import (
 from service.storage.recording.unsaved_result import STARS
 from service.storage.sql import tables
 from service.storage.sql.columns import Row
+from service.storage.sql.statements import rows_of
 from service.storage.sql.tables import batches, missions, results
 from service.times import Utc
 from service.trends.quantities import QUANTITIES, value_names
@@ -163,6 +164,27 @@ def read_record(connection: Connection, id: str, *, archived: bool = False) -> a
         archived=archived,
         frame=UNSET if frame is None else _frame_of(frame),
     )
+
+
+def current_of(connection: Connection, id: str) -> Any:
+    """Current result of a result's batch, as a row of `id` and `parent_id`; None if it is gone."""
+    batch = select(results.c.batch_id).where(results.c.id == id).scalar_subquery()
+    chosen = select(results.c.id, results.c.parent_id).where(
+        results.c.batch_id == batch, results.c.current
+    )
+    return connection.execute(chosen).first()
+
+
+def adopted_what_ifs(connection: Connection, selected: ResultFilter, limit: int) -> list[Row]:
+    """Selected current results that are adopted what-ifs, newest first: id, parent, batch, time."""
+    query = (
+        select(results.c.id, results.c.parent_id, batches.c.batch, batches.c.time)
+        .join_from(results, batches)
+        .where(*selected.conditions(), results.c.parent_id.is_not(None))
+        .order_by(results.c.id.desc())
+        .limit(limit)
+    )
+    return rows_of(connection, query)
 
 
 def answer_from_json(text: str | bytes) -> answers.RecordedAnswer:

@@ -1,6 +1,7 @@
 """Reading of a change's author and reason from its request's body, as kept in the audit list."""
 
 import json
+import re
 from contextlib import suppress
 from typing import Any
 
@@ -32,6 +33,12 @@ def naming_result(body: str | None, id: str) -> str:
     sent = json.loads(body or "{}")
     first = {"result": id} | {name: sent[name] for name in ("who", "comment") if name in sent}
     return json.dumps(first | sent, ensure_ascii=False)
+
+
+def result_in(body: str | None) -> str | None:
+    """Id of the result at the start of a what-if's stored request body; None in any other body."""
+    found = re.match(r'\{"result": "(\w+)"', body or "")
+    return None if found is None else found[1]
 
 
 def signature_of(connection: Connection, parent: str, id: str) -> Signature | None:

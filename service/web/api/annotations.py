@@ -96,15 +96,15 @@ def add_annotation(body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
     problems=(503,),
 )
 def delete_annotation(
-    id: AnnotationId, query: FromQuery[params.AuthorQuery], app: AppDep, change: ChangeDep
+    id: AnnotationId, query: FromQuery[params.StatementQuery], app: AppDep, change: ChangeDep
 ) -> Response:
-    """Delete an annotation; the audit list keeps its text, and who deleted it."""
-    change.author(query.who)
+    """Delete an annotation; the audit list keeps its text, and who deleted it and why."""
+    who = change.author(query.who)
     found = app.annotations.get(id)
     if found.spacecraft is not None and not change.caller.may_see(found.spacecraft):
         raise NotFound(f"there is no annotation with the id {shown_value(id)}")
     _require(change.caller, found.spacecraft)
-    return json_response(app.annotations.delete(id, change.entry()))
+    return json_response(app.annotations.delete(id, who, query.comment, change.entry()))
 
 
 def _require(caller: Caller, spacecraft: str | None) -> None:

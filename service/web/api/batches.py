@@ -205,7 +205,7 @@ def what_if(
     record, entry = asked.record or asked.adopt, None
     if record:
         require_scope(change.caller, "operate")
-        request.state.changes = "what_if"
+        request.state.changes = "adopt_what_if" if asked.adopt else "what_if"
         entry = change.entry(201)
     answered = app.results.what_if(id, asked.options, record=record, adopt=asked.adopt, entry=entry)
     return answer_response(answered, recorded=record)

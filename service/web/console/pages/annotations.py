@@ -40,6 +40,7 @@ def annotations_page(query: FromQuery[AnnotationsQuery], context: ContextDep) ->
         page=page,
         around=_around,
         spacecraft=context.spacecraft,
+        may_write_of_all=context.caller.spacecraft is None,
     )
 
 

@@ -1,5 +1,6 @@
 """Pages of batches: the list, and one batch with star field, votes and what-if."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 from urllib.parse import quote, urlencode
@@ -11,7 +12,7 @@ from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
 
 from service.app.context import ALL_RUNS
-from service.contract.answers import Answer, Summary
+from service.contract.answers import Answer, Result, Summary
 from service.contract.answers import Star as FoundStar
 from service.contract.base import Page
 from service.errors import BadBatch, BadInput, Fault, NotFound, shown_value
@@ -48,7 +49,9 @@ VIEWS = ("all", "field")
 """Contents of the chart to choose from: all candidates, or the field of view only."""
 
 MUCH_WORSE = 2.0
-"""Greatest ratio of a new residual to the former and the predicted one without a warning."""
+"""Greatest ratio of a residual to the predicted one without a warning."""
+STATUSES = ("good", "suspect", "none")
+"""Statuses of an attitude, the best first."""
 SCALE = 3.0
 """Least range of the bars of the trackers' residuals, in predicted residuals."""
 
@@ -146,6 +149,7 @@ def batch_page(request: Request, id: ResultId, context: ContextDep) -> Response:
         options=options.model_dump(exclude_none=True, exclude_unset=True),
         toml=toml_of(fields),
         adoption=adoption(answer, shown),
+        putting_back=_putting_back(context, record),
         pointing=_pointing(shown),
         timings_us=structs.asdict(shown.timings_us),
         panels=context.panels("batch_page", id, answer),
@@ -162,11 +166,11 @@ def adoption(before: Answer, after: Answer) -> list[str]:
         for word in words
         if getattr(before.counts, word) != getattr(after.counts, word)
     ]
-    statuses = [each.attitude.status if each.attitude else "none" for each in (before, after)]
+    statuses = [_status(each) for each in (before, after)]
     if statuses[0] != statuses[1]:
         changes.append(f"attitude {statuses[0]} to {statuses[1]}")
     return [
-        *_worse_fit(before, after),
+        *_worse(before, after),
         f"1 batch changes: {', '.join(changes) or 'its counts and its status stay the same'}.",
         f"Lists, rates and every trend of {after.spacecraft} show the new result at {after.time}.",
         (
@@ -176,19 +180,32 @@ def adoption(before: Answer, after: Answer) -> list[str]:
     ]
 
 
-def _worse_fit(before: Answer, after: Answer) -> list[str]:
-    """Warning if a what-if loses the attitude, or has much larger residuals; otherwise empty."""
-    if after.attitude is None:
-        return ["▲ The new result has no attitude."] if before.attitude else []
-    if after.attitude.residual_rms_arcsec is None:
-        return []
+def _worse(before: Answer, after: Answer) -> Iterator[str]:
+    """Warnings, with both figures, of stars, status and residual that are worse in the result."""
+    stars = before.counts.unique, after.counts.unique
+    if stars[1] < stars[0]:
+        yield f"▲ Fewer stars are identified: {stars[0]} to {stars[1]} of {after.counts.observed}."
+    if STATUSES.index(_status(after)) > STATUSES.index(_status(before)):
+        yield f"▲ The attitude is worse: {_status(before)} to {_status(after)}."
+    if after.attitude is None or after.attitude.residual_rms_arcsec is None:
+        return
     new, predicted = after.attitude.residual_rms_arcsec, after.attitude.predicted_rms_arcsec
     old = before.attitude.residual_rms_arcsec if before.attitude else None
-    usual = max(filter(None, (old, predicted)), default=0.0)
-    if new <= MUCH_WORSE * usual:
+    if old is not None and new > old and arcsec(new) != arcsec(old):
+        yield f"▲ The attitude fits its stars worse: residual rms {arcsec(old)} to {arcsec(new)}."
+    elif old is None and predicted is not None and new > MUCH_WORSE * predicted:
+        yield f"▲ The attitude fits its stars badly: residual rms {arcsec(new)}."
+
+
+def _status(answer: Answer) -> str:
+    return "none" if answer.attitude is None else answer.attitude.status
+
+
+def _putting_back(context: PageContext, record: Result) -> list[str]:
+    """Sentences about the changes by putting the former result back; none for any other result."""
+    if record.parent is None or not record.current:
         return []
-    was = "no attitude" if old is None else arcsec(old)
-    return [f"▲ The new attitude fits its stars worse: residual rms {was} to {arcsec(new)}."]
+    return adoption(record.answer, context.app.results.get(record.parent).answer)
 
 
 @console_page("/latest/{name}", "Latest batch", Policy("read", "path"), section="/batches")

@@ -1,7 +1,7 @@
 """Page of one spacecraft: trends over a period, and its worst batches."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 from urllib.parse import quote, urlencode
 
@@ -300,10 +300,13 @@ def _before(name: str, query: SpacecraftQuery, shown: ShownPeriod | None) -> Per
 
 @dataclass(frozen=True)
 class Change:
-    """Settings that came into force within the shown period."""
+    """Change within the shown period: settings in force, or a result; with the page about it."""
 
     since: str
     text: str
+    title: str
+    path: str
+    query: Mapping[str, str] = field(default_factory=dict)
 
 
 def _changes(
@@ -313,14 +316,27 @@ def _changes(
     query: SpacecraftQuery,
     stretch: ShownPeriod | None,
 ) -> list[Change]:
-    """Changes of settings within a period of live batches, and within the period before it."""
-    if stretch is None or query.run != LIVE:
+    """Changes of settings of live batches, and adopted results, in a period and the one before."""
+    if stretch is None:
         return []
-    earliest_ns = stretch.start.tai_ns - BEFORE_S.get(query.before, 0) * 10**9
-    adopted = {each.adopted[:19]: each for each in context.app.adoptions.in_force(name).history}
+    earliest = shifted(stretch.start, -float(BEFORE_S.get(query.before, 0)))
     found = []
+    for row, signature in context.app.results.adopted(name, query.run, earliest, stretch.end):
+        what = f"What-if of batch {row['batch']} adopted"
+        if signature is not None:
+            what += f" by {signature.who}" + (f": {signature.comment}" if signature.comment else "")
+        found.append(Change(row["time"], what, "batch", f"/batches/{row['id']}"))
+    if query.run == LIVE:
+        found += _changes_of_settings(context, name, history, earliest, stretch.end)
+    return sorted(found, key=lambda each: recorded_utc(each.since).tai_ns)
+
+
+def _changes_of_settings(
+    context: PageContext, name: str, history: Sequence[MissionThen], start: Utc, end: Utc
+) -> Iterator[Change]:
+    adopted = {each.adopted[:19]: each for each in context.app.adoptions.in_force(name).history}
     for each in history[1:]:
-        if not earliest_ns <= recorded_utc(each.since).tai_ns < stretch.end.tai_ns:
+        if not start.tai_ns <= recorded_utc(each.since).tai_ns < end.tai_ns:
             continue
         adoption = adopted.get(each.since[:19])
         what = "Settings changed with the mission file"
@@ -329,8 +345,7 @@ def _changes(
             what = "The mission file" if version is None else f"Calibration version {version}"
             what += f" adopted by {adoption.who}"
             what += f": {adoption.note}" if adoption.note else ""
-        found.append(Change(each.since, what))
-    return found
+        yield Change(each.since, what, "settings", "/missions", {"spacecraft": name})
 
 
 def _annotations(context: PageContext, name: str, stretch: ShownPeriod | None) -> Page[Annotation]:

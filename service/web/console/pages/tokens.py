@@ -1,11 +1,15 @@
 """Pages for operators: tokens, the audit list of changes, and sign-in."""
 
+import re
 from typing import Annotated
+from urllib.parse import unquote
 
 from pydantic import Field
 from starlette.responses import Response
 
 from service.access import MAX_DAYS, SCOPES, list_entries
+from service.contract.access import AuditEntry
+from service.storage.recording.signatures import result_in
 from service.web.console.page import (
     EMPTY_LAYOUT,
     ContextDep,
@@ -42,7 +46,30 @@ def audit_page(query: FromQuery[AuditPageQuery], context: ContextDep) -> Respons
             action=query.action.strip().replace(" ", "_"),
             about=query.about.strip(),
         )
-    return context.rendered("audit.html.jinja", query.run, page=page, query=query)
+    return context.rendered(
+        "audit.html.jinja", query.run, page=page, query=query, object_of=_object
+    )
+
+
+_WITH_A_PAGE = re.compile(r"/api/v1/((batches|alarms|spacecraft|replays)/([^/?]+))")
+
+
+def _object(entry: AuditEntry) -> tuple[str, str] | None:
+    """Path and name of the page about the object of a change; None if it has no page.
+
+    For a what-if it is the page of the recorded result, which leads to the former one.
+    """
+    if result := result_in(entry.body):
+        return f"/batches/{result}", f"batch {result}"
+    found = _WITH_A_PAGE.match(entry.about)
+    if found is None:
+        return None
+    path, kind, name = found.groups()
+    return f"/{unquote(path)}", f"{OBJECTS[kind]} {unquote(name)}".strip()
+
+
+OBJECTS = {"batches": "batch", "alarms": "alarm", "spacecraft": "", "replays": "replay"}
+"""Word before the name of an object, by the first part of its page's path."""
 
 
 @console_page("/tokens", "Tokens", OPERATE, section="/about")

@@ -1,6 +1,7 @@
 // Annotations of the shown period: the marks that charts draw, and the form that writes them.
 import { posix } from "./times.js";
 import { attempt, rememberWho, send } from "./actions.js";
+import { signed } from "./sign.js";
 import { refreshSoon } from "./live_updates.js";
 
 const form = document.getElementById("annotate");
@@ -13,6 +14,16 @@ export function annotationsShown() {
     start: posix(start),
     end: end ? posix(end) : null,
   }));
+}
+
+async function remove(button) {
+  const sign = await signed("Delete this annotation", ["It is gone from every page. The audit list keeps its text, your name and the reason."], "Delete");
+  if (sign === null) return;
+  attempt(button, message, async () => {
+    await send("DELETE", `/api/v1/annotations/${button.dataset.delete}?${new URLSearchParams(sign)}`);
+    refreshSoon();
+    return "Annotation deleted.";
+  });
 }
 
 if (form) {
@@ -34,17 +45,10 @@ if (form) {
       return;
     }
     const button = event.target.closest("[data-delete]");
-    if (!button || !who.reportValidity()) return;
-    attempt(button, message, async () => {
-      await send("DELETE", `/api/v1/annotations/${button.dataset.delete}?${new URLSearchParams({ who: who.value.trim() })}`);
-      refreshSoon();
-      return "Annotation deleted.";
-    });
+    if (button) remove(button);
   });
   // The time of a click on a chart.
   document.addEventListener("moment", ({ detail: { seconds } }) => {
     start.value = new Date(Math.round(seconds) * 1000).toISOString();
-    message.className = "soft";
-    message.textContent = "From is the time of the click.";
   });
 }

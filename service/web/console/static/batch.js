@@ -38,16 +38,14 @@ async function draw(where) {
   }
 }
 
-// Adopts a result with a signature, and notes it in the trends, where it can be found again.
+// Adopts a result with a signature, which the batch, its former result, trends and the audit list show.
 async function adopt(button) {
-  const { adopt: options, parent, title, changes, note, time, spacecraft } = button.dataset;
+  const { adopt: options, parent, title, changes } = button.dataset;
   const sign = await signed(title, changes.split("|"), "Adopt");
   if (sign === null) return;
   attempt(button, document.getElementById("try-status"), async () => {
-    const wanted = { options: JSON.parse(options), adopt: true, ...sign, comment: sign.comment || null };
+    const wanted = { options: JSON.parse(options), adopt: true, ...sign };
     const adopted = await send("POST", `/api/v1/batches/${parent}/what-if`, JSON.stringify(wanted));
-    const text = sign.comment ? `${note}: ${sign.comment}` : note;
-    await send("POST", "/api/v1/annotations", JSON.stringify({ text, start: time, spacecraft, who: sign.who }));
     location.href = rooted(`/batches/${adopted.id}`);
   });
 }
