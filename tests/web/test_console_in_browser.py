@@ -339,17 +339,18 @@ def test_a_what_if_changes_what_becomes_of_an_ambiguous_star(browser, address, c
     shows(browser, "This is an adopted what-if")
     assert "ambiguous" not in text(browser, ".votes")
     assert client.get(f"/api/v1/batches/{found}").json()["current"] is False
-    noted = client.get("/api/v1/annotations", params={"spacecraft": "XTE"}).json()["items"]
-    assert any("adopted (identifier): it is clear" in each["text"] for each in noted)
+    # The record of the adoption tells of it: no note that someone can delete.
+    notes = client.get("/api/v1/annotations", params={"spacecraft": "XTE"}).json()["items"]
+    assert not any("adopted" in each["text"] for each in notes)
     # Undone: the answer of the former is current again.
     browser.run("document.querySelector('.note [data-adopt]').click()")
+    assert "▲ Fewer stars are identified" in text(browser, "dialog")
     browser.run(SIGN)
     browser.wait(lambda: "ambiguous" in text(browser, ".votes"))
     shows(browser, "This is an adopted what-if")
-    for each in noted[:2]:
-        client.delete(f"/api/v1/annotations/{each['id']}", params={"who": "J. Operator"})
     browser.open(f"{address}/batches/{found}")
-    shows(browser, "This batch has another current result")
+    shows(browser, "Not the current result.")
+    shows(browser, "adopted by J. Operator")
     assert browser.complaints == []
 
 
@@ -626,6 +627,36 @@ def watched(client, drawn):
     )
     assert answer.status_code == 202
     return run, answer.headers["Location"]
+
+
+SEND = """(form => {{ const files = new DataTransfer();
+    files.items.add(new File([{}], 'pass.ndjson')); form.elements.file.files = files.files;
+    form.querySelector('button').click(); }})(document.getElementById('replay'))"""
+
+
+def test_a_replay_is_cancelled_and_continued_where_its_row_is(browser, address, batch):
+    """The row leads to the form, with the run filled in; then it says that it was continued."""
+    run = f"again-{next(_numbers)}"
+    lines = "".join(json.dumps(batch | {"batch": f"{run}-{k}"}) + "\n" for k in range(20_000))
+    browser.open(f"{address}/runs")
+    browser.run(f"document.querySelector('#replay [name=run]').value = {json.dumps(run)}")
+    browser.run(SEND.format(json.dumps(lines)))
+    rows = (
+        f"[...document.querySelectorAll('#runs tr')].filter(row => row.innerText.includes('{run}'))"
+    )
+    cancel = f"{rows}.map(row => row.querySelector('[data-send^=DELETE]')).find(Boolean)"
+    again = f"{rows}.map(row => row.querySelector('a[href*=into]')).find(Boolean)"
+    browser.wait(lambda: browser.run(f"!!{cancel}"))
+    browser.run(f"{cancel}.click()")
+    browser.wait(lambda: browser.run(f"!!{again}"))
+    browser.run("document.querySelector('#replay').reset()")
+    browser.run(f"{again}.click()")
+    browser.wait(lambda: browser.run("document.querySelector('#replay [name=run]').value") == run)
+    assert browser.run("document.activeElement.name") == "file"
+    browser.run(SEND.format(json.dumps(lines[:1000].partition("\n")[0])))
+    browser.wait(lambda: browser.run(f"{rows}.some(row => row.innerText.includes('continued '))"))
+    assert not browser.run(f"!!{again}")
+    assert browser.complaints == []
 
 
 def test_a_shift_from_the_overview_to_the_star_and_the_alarm(browser, address, client, watched):
