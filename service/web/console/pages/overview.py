@@ -11,7 +11,6 @@ from starlette.responses import Response
 
 from service.observations.schema import LIVE
 from service.storage.queries.fleet import PERIODS_S, Fleet, FleetCells, FleetRow, Period, last_day
-from service.times import Utc
 from service.trends.limits import Severity
 from service.trends.measures import BatchShare, StarShare
 from service.trends.quantities import QUANTITIES, OneOf
@@ -190,21 +189,12 @@ def overview_page(query: page.FromQuery[OverviewQuery], context: page.ContextDep
         any_batch=fleet.as_of is not None and any(line.item.latest_batch for line in every),
         every=every,
         top=top,
-        day=_period(fleet.as_of),
+        day=last_day(fleet.as_of) if fleet.as_of else None,
         periods=list(PERIODS_S),
         shown=SHOWN,
         heat=_heat(fleet, found, shares, query.period),
-        alarms=page.alarm_counts([each for line in every for each in line.item.alarms]),
         notices=context.panels("overview_page"),
     )
-
-
-def _period(as_of: Utc | None) -> dict[str, str]:
-    """Query parameters of the last day of a run."""
-    if as_of is None:
-        return {}
-    start, end = last_day(as_of)
-    return {"start": start.text, "end": end.text}
 
 
 def _words_of(lines: list[OverviewLine]) -> str:

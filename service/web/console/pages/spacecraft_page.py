@@ -20,7 +20,6 @@ from service.times import (
     parse_utc,
     recorded_utc,
     shifted,
-    utc_now,
 )
 from service.trends.quantities import (
     QUANTITIES,
@@ -74,8 +73,6 @@ class SpacecraftQuery(PageQuery):
     end: End = None
     by: RankedName | None = None
     tracker: Key | None = None
-    until: Literal["latest", "now"] = "latest"
-    """End of a range of live batches: the latest batch, or now."""
     y: Vertical = "robust"
     beside: list[Annotated[str, Field(max_length=300)]] = Field(default_factory=list)
     """Other spacecraft in the same charts; one text may name several, separated by commas."""
@@ -94,7 +91,6 @@ class SpacecraftQuery(PageQuery):
         return {
             "by": self.by,
             "tracker": self.tracker,
-            "until": self.until if self.until == "now" else None,
             "y": self.y if self.y != "robust" else None,
             "beside": ",".join(self.others) or None,
             "before": self.before or None,
@@ -222,8 +218,6 @@ def shown_period(
         # A length that is typed beside both ends replaces them.
         query = query.model_copy(update={"start": None, "end": None})
     end = query.end or second_after(latest[0].time)
-    if query.until == "now" and query.run == LIVE and not query.end:
-        end = max(end, utc_now(), key=lambda moment: moment.tai_ns)
     if query.start or query.end:
         start = query.start or shifted(end, -range_s(query.range or "day"))
         return ShownPeriod(None, start, end)

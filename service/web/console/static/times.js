@@ -22,18 +22,16 @@ export function dayOfYear(moment) {
 }
 
 const FORM = /^(\d{4})[-/.:](?:(\d\d?)[-/.](\d\d?)(?: \(\d{3}\))?|(\d{3}))(?:(?:[T/:.-]|,? )(\d\d?)[:.](\d\d)(?:[:.](\d\d(?:\.\d{1,9})?))? ?(Z|UTC?|GMT|[+-]\d\d(?::?\d\d)?)?)?$/i;
-const EXAMPLES = "such as 2026-11-27, 2026-11-27 18:30 or 2026-331/18:30:00";
 
 // A typed time as the service reads it; throws what is wrong with it, in words.
 export function typedTime(text) {
   const found = FORM.exec(text.trim().replace(/\s+/g, " "));
-  if (!found) throw new Error(`must be UTC, ${EXAMPLES}`);
+  if (!found) throw new Error(`must be UTC, such as 2026-11-27, 2026-11-27 18:30 or 2026-331/18:30:00`);
   const [year, month, day, ordinal, hour, minute, second] = found.slice(1, 8).map((part = "0") => part.padStart(2, "0"));
   const date = found[4] ? `${year}-${ordinal}` : `${year}-${month}-${day}`;
-  const zone = /^[+-]/.test(found[8]) ? found[8] : "Z";
   const moment = found[4] ? new Date(Date.UTC(year, 0, Number(ordinal))) : new Date(Date.UTC(year, month - 1, day));
   const exists = found[4] ? Number(ordinal) > 0 && moment.getUTCFullYear() === Number(year) : moment.toISOString().startsWith(date);
   if (!exists) throw new Error(`${date}: there is no such day`);
   if (hour > 23 || minute > 59 || second >= 61) throw new Error(`${hour}:${minute}:${second}: there is no such time of day`);
-  return { text: `${date}T${hour}:${minute}:${second}${zone}`, seconds: moment.getTime() / 1000 + hour * 3600 + minute * 60 + Number(second) };
+  return { text: `${date}T${hour}:${minute}:${second}${/^[+-]/.test(found[8]) ? found[8] : "Z"}`, seconds: moment.getTime() / 1000 + hour * 3600 + minute * 60 + Number(second) };
 }
