@@ -16,6 +16,10 @@ MOST_REMARKS = 40
 EARTH_RADIUS_KM = 6_350.0
 """A radius in km a little below Earth's polar radius, within which no spacecraft can be."""
 EARTH_GM_KM3_PER_S2 = 398_600.4418
+BRIGHTEST_MAG, FAINTEST_MAG = -0.5, 12.5
+"""Magnitudes beyond which no field has several stars that a tracker sees."""
+LEAST_ALIKE = 3
+"""Least number of stars with one impossible magnitude, which is then no measurement."""
 _VECTORS = ("velocity_km_per_s", "position_km")
 
 
@@ -49,15 +53,26 @@ def _of_tracker(tracker: "TrackerIn", remarks: list[str]) -> "TrackerIn":
         words = f"{len(stars) - len(once)} of {len(stars)} stars of {tracker.tracker}"
         remarks.append(f"repeated_stars: {words} are exact repeats, and were counted once")
         stars = list(once.values())
-    zeros = sum(star.magnitude == 0.0 for star in stars)
-    if zeros > 1:
-        words = f"{zeros} stars of {tracker.tracker} have the magnitude 0"
+    filled = _fill_magnitude([star.magnitude for star in stars])
+    if filled is not None:
+        count = sum(star.magnitude == filled for star in stars)
+        words = f"{count} stars of {tracker.tracker} have the magnitude {filled:g}"
         remarks.append(f"magnitudes_not_given: {words}, which was taken as not given")
         stars = [
-            star.model_copy(update={"magnitude": None}) if star.magnitude == 0.0 else star
+            star.model_copy(update={"magnitude": None}) if star.magnitude == filled else star
             for star in stars
         ]
     return tracker if stars is tracker.stars else tracker.model_copy(update={"stars": stars})
+
+
+def _fill_magnitude(magnitudes: list[float | None]) -> float | None:
+    """The magnitude that stands for none: 0 of several stars, or an impossible one of all."""
+    if magnitudes.count(0.0) > 1:
+        return 0.0
+    first = magnitudes[0]
+    is_fill = first is not None and not BRIGHTEST_MAG <= first <= FAINTEST_MAG
+    is_of_all = len(magnitudes) >= LEAST_ALIKE and magnitudes.count(first) == len(magnitudes)
+    return first if is_fill and is_of_all else None
 
 
 def _key(star: "StarIn") -> tuple[Any, ...]:

@@ -104,10 +104,11 @@ def test_magnitudes_that_no_star_has_are_refused_by_field_and_value(magnitude):
         submission_from_json(json.dumps(body))
 
 
-def test_magnitudes_of_zero_are_not_given(sky):
+@pytest.mark.parametrize("magnitude", [0.0, -1.0, 25.0])
+def test_magnitudes_that_no_field_has_are_not_given(magnitude, sky):
     body = bodies("ok.csv")[0]
     for star in body["observations"][0]["stars"]:
-        star["magnitude"] = 0.0
+        star["magnitude"] = magnitude
     _, found = answered(body, sky)
     assert "magnitudes_not_given" in codes(found.warnings)
     assert found.solution is not None
