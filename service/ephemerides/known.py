@@ -22,6 +22,8 @@ CLOCK_NS = 200
 DISCRETE_NS = 1_000_000
 """Nanoseconds about a record of a discrete segment for which its attitude holds."""
 
+FILL_RAD = 0.05
+"""Least jump in radians to the identity that marks it as a fill value."""
 STILL_RAD = 1e-5
 """Rotation in radians between records above which rates of zero count as missing."""
 
@@ -128,7 +130,42 @@ def known_attitudes(file: str, object_name: str, segments: Sequence[Segment]) ->
     """The attitudes of a file, with its segments in order of time; raises `BadFile` for none."""
     if not segments:
         raise BadFile(Fault(file, "has no attitude"))
+    for each in segments:
+        _require_no_fill(file, each)
     return KnownAttitudes(object_name, in_order(file, segments))
+
+
+def _require_no_fill(file: str, segment: Segment) -> None:
+    """Raise `BadFile` for records of the identity that stand for no attitude.
+
+    The body would have to jump there, or away, much faster than it turns beside these records.
+    """
+    q, times = segment.quaternion, segment.time_ns
+    is_identity = ~q[:, :3].any(axis=1)
+    others = np.flatnonzero(~is_identity)
+    if len(others) < 2:
+        return
+    for row in np.flatnonzero(is_identity).tolist():
+        after = int(np.searchsorted(others, row))
+        sides = []
+        if after >= 2:
+            sides.append((others[after - 1], others[after - 2]))
+        if after <= len(others) - 2:
+            sides.append((others[after], others[after + 1]))
+        jumps = [_angle_rad(q[row], q[near]) for near, _ in sides]
+        own = [
+            _angle_rad(q[near], q[far])
+            * abs((times[row] - times[near]) / (times[near] - times[far]))
+            for near, far in sides
+        ]
+        if sides and all(j > max(FILL_RAD, 2.0 * o) for j, o in zip(jumps, own, strict=True)):
+            jump_deg = np.degrees(min(jumps))
+            message = f"is the identity, {jump_deg:.3g} degrees from its neighbours: no attitude?"
+            raise BadFile(Fault(f"{file}, {segment.place}, record {row + 1}", message))
+
+
+def _angle_rad(one: Vector, other: Vector) -> float:
+    return float(np.linalg.norm(rotation_vectors(one[None], other[None])))
 
 
 S = TypeVar("S", bound=Span)

@@ -96,6 +96,21 @@ def test_rates_in_columns_of_other_names_are_refused(name, tmp_path):
         read(SPUN.replace("rate_x,rate_y,rate_z", f"{x},{y},{z}"), tmp_path)
 
 
+@pytest.mark.parametrize("fill", [[0], [2], [1, 2], [4]])
+def test_an_identity_that_stands_for_no_attitude_is_refused(fill, tmp_path):
+    def line(second, angle_deg):
+        cells = ",".join(map(repr, about_z(angle_deg).tolist()))
+        return f"1996-01-10T12:00:0{second}Z,{cells}"
+
+    slow = [line(k, 30.0 + 0.1 * k) for k in range(5)]
+    assert len(read("\n".join(["time,q1,q2,q3,qc", *slow]), tmp_path)) == 5
+    filled = [line(k, 0.0) if k in fill else slow[k] for k in range(5)]
+    with pytest.raises(BadFile, match=rf"record {fill[0] + 1}: is the identity, \S+ degrees from"):
+        read("\n".join(["time,q1,q2,q3,qc", *filled]), tmp_path)
+    through = [line(k, 20.0 * (k - 2)) for k in range(5)]
+    assert len(read("\n".join(["time,q1,q2,q3,qc", *through]), tmp_path)) == 5
+
+
 def test_a_truth_of_two_spacecraft_is_refused(tmp_path):
     line = '{{"spacecraft": "{}", "time": "1996-01-10T12:00:0{}Z", "quaternion": [0, 0, 0, 1]}}'
     with pytest.raises(BadFile, match=r"line 2, spacecraft: must be A, as above.*got 'B'"):
