@@ -266,7 +266,8 @@ def _served(settings: Settings, log: Path) -> Iterator[subprocess.Popen[bytes]]:
         server.terminate()
         try:
             server.wait(STOP_S)
-        except subprocess.TimeoutExpired:
+        except (subprocess.TimeoutExpired, KeyboardInterrupt):
+            # A second Ctrl-C ends the wait.
             server.kill()
             server.wait()
         signal.signal(signal.SIGTERM, before)

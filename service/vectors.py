@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 Projection = Literal["gnomonic", "equidistant", "equisolid", "stereographic"]
-"""Projection of the sky by a lens: on a plane, or as a fisheye in one of three ways."""
+"""Name of a lens's projection of the sky: on a plane, or as a fisheye in one of three ways."""
 
 Vector = npt.NDArray[np.float64]
 Matrix = npt.NDArray[np.float64]

@@ -186,7 +186,7 @@ class Spacecraft:
 def _quantities(
     named: Sequence[QuantityName], tracker: str | None, field: str = "quantity"
 ) -> tuple[QuantityName, ...]:
-    """Names of the requested quantities, or of all; raises `BadBatch` where a tracker has none."""
+    """Names of the requested quantities, or of all; `BadBatch` for one that trackers lack."""
     if tracker is None:
         return tuple(named) or trend_names()
     for name in named:

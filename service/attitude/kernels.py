@@ -148,7 +148,7 @@ def _expected_square(b, weights, p, chosen, first, second):  # type: ignore[no-u
 
 @njit(error_model="numpy")
 def fit_attitude(b, r, sigma_rad, worst_rad, chosen, workspace):  # type: ignore[no-untyped-def]
-    """Fit an attitude to matched vectors, with figures in display units; false if there is none.
+    """Fit an attitude to matched vectors into `workspace`, in arcsec; false if there is none.
 
     `chosen` is the row of the method whose attitude, covariance and residuals go to the workspace.
     TASTE is always QUEST's: only at the optimal attitude is the weighted sum of squares chi-square

@@ -82,7 +82,7 @@ def njit_inlined(kernel: Callable[..., Any]) -> Any:
 
 
 def njit_allocating(kernel: Callable[..., Any]) -> Any:
-    """A decorator for kernels that create arrays, although their caller counts no references.
+    """A decorator that compiles kernels with numba's runtime, so that they can create arrays.
 
     Otherwise it would be compiled as its caller is. Like that caller it returns only numbers.
     """

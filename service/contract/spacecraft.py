@@ -302,7 +302,7 @@ class CachedZone(CacheUse, frozen=True, kw_only=True):
 
 
 class CachedRunCatalog(CacheUse, frozen=True, kw_only=True):
-    """Run catalog in the service's cache."""
+    """Entry of the service's cache with a run catalog: its digest, epoch and number of stars."""
 
     digest: Digest
     epoch_year: float

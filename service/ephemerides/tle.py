@@ -8,7 +8,9 @@ equator and equinox of J2000 with the matching models of ERFA: precession of 197
 import codecs
 import math
 import re
+from bisect import bisect_left
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import IO, Any
 
 import erfa
@@ -22,7 +24,7 @@ from service.vectors import Matrix, Vector
 
 LENGTH = 69
 MAX_AGE_D = 7.0
-"""Greatest age in days of an element set: its error grows by 1 to 3 km per day."""
+"""Greatest difference in days to an element set's epoch: errors grow by 1 to 3 km per day."""
 MOST_SETS = 100_000
 MAX_LINE_BYTES = 200
 _FIRST_CENTURY_YEAR = 57
@@ -77,7 +79,9 @@ class TleEphemeris:
 
         None more than `MAX_AGE_D` from every epoch, and if SGP4 finds that the object decayed.
         """
-        nearest = min(self.sets, key=lambda each: abs(each.epoch_ns - moment.tai_ns))
+        after = bisect_left(self.sets, moment.tai_ns, key=attrgetter("epoch_ns"))
+        beside = self.sets[max(after - 1, 0) : after + 1]
+        nearest = min(beside, key=lambda each: abs(each.epoch_ns - moment.tai_ns))
         since_s = (moment.tai_ns - nearest.epoch_ns) * 1e-9
         if abs(since_s) > MAX_AGE_D * DAY_S:
             return None

@@ -446,7 +446,8 @@ class MessageReader:
         """Raise `BadFile` for a segment about another object than the previous ones."""
         about = (metadata.values["OBJECT_NAME"], metadata.values["OBJECT_ID"])
         if self._object not in (None, about):
-            raise metadata.fault("OBJECT_ID", "must be the same in every segment")
+            differs = "OBJECT_NAME" if self._object_name != about[0] else "OBJECT_ID"
+            raise metadata.fault(differs, "must be the same in every segment")
         self._object = about
 
     def _count_state(self, token: Token, epoch: str, time_ns: int, before: list[int]) -> None:

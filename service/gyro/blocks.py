@@ -259,7 +259,7 @@ def block_from_model(model: GyroBlockIn, spacecraft: str, run: str | None = None
 
 
 def _once(times_s: Vector, rates: Vector) -> tuple[Vector, Vector]:
-    """Times and rates without exact repetitions of the sample before, if they are as many."""
+    """Times and rates without exact repeats of the sample before; unequal numbers as they are."""
     if times_s.size != len(rates):
         return times_s, rates
     again = (np.diff(times_s) == 0.0) & (np.diff(rates, axis=0) == 0.0).all(axis=1)

@@ -379,7 +379,7 @@ class RunningReplay:
         self._over.set()
 
     def resume(self, lines: ReplaySource) -> None:
-        """Resume after the last line that an earlier process stored as done."""
+        """Start the replay again, after the last line that an earlier process stored as done."""
         self._progress.save("running")
         self._progress.require_saved()
         self._start_thread(lines)

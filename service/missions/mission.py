@@ -140,7 +140,7 @@ class ToleranceLimits(NamedTuple):
 
 
 class Switches(NamedTuple):
-    """The switches of the pair tests in the form that kernels take."""
+    """Named tuple with true for each pair test that is on, in the form that kernels take."""
 
     magnitude: bool
     cross_product: bool

@@ -105,7 +105,7 @@ class CsvTable:
         self._places = None if apart is None else self._together(apart)
 
     def rows(self) -> Iterator[Row]:
-        """The rows of the file in order, grouped by batch; can be called once."""
+        """The rows of the file, those of one batch together; to be called once."""
         for line in self._lines() if self._places is None else self._lines_at(self._places):
             if (row := self._row(line)) is not None:
                 yield row

@@ -24,7 +24,7 @@ _VECTORS = ("velocity_km_per_s", "position_km")
 
 
 def without_fill_values(batch: "BatchIn") -> "BatchIn":
-    """A batch without fill values and duplicate stars, with remarks on both.
+    """The batch with fill values and repeated stars removed, which its `remarks` then report.
 
     Raises `BadBatch` for a position inside the Earth, and for a position and velocity that would be
     an Earth orbit if the position were in metres.

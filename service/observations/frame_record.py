@@ -54,7 +54,7 @@ class FrameRecord:
 
 
 def rounded_counts(value: float, digits: int) -> float:
-    """Counts rounded to a number of decimals, or to four significant digits if small."""
+    """A number of counts rounded to `digits` decimals, or to four significant digits if small."""
     if not math.isfinite(value) or value == 0.0 or abs(value) >= 100.0 * 10.0**-digits:
         return round(value, digits)
     return round(value, 3 - math.floor(math.log10(abs(value))))

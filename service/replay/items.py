@@ -307,7 +307,7 @@ def _is_unsteady(rates_deg_per_s: Sequence[vectors.Vector], passed_s: float) -> 
 
 
 def reporting_to_carrier(report: Report, carrier: AttitudeCarrier) -> Report:
-    """Wrap a report so that every outcome is passed to the carrier too."""
+    """Wrap a report so that outcomes also go to the carrier of attitudes to later batches."""
 
     def both(outcome: LineOutcome) -> None:
         carrier.note(outcome)

@@ -261,7 +261,7 @@ def _pages(reading: Reading, selected: BlockFilter) -> Iterator[TablePage]:
 
 
 def _page(row: Any, selected: BlockFilter) -> TablePage:
-    """Table page with the samples of one gyro block that lie in the period."""
+    """Columns of a product's table for one gyro block's samples from `start` to before `end`."""
     block = block_of(row)
     times_ns = block.tai_ns
     first, last = 0, times_ns.size

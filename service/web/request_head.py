@@ -39,7 +39,7 @@ def refusal_of(
 
 
 def _coding_refusal(codings: list[bytes], http_version: str) -> Refusal | None:
-    """Refusal of a Transfer-Encoding with unknown body length (RFC 9112, 6.1 and 6.3), or None."""
+    """Refusal of a Transfer-Encoding other than one `chunked` (RFC 9112, 6.1, 6.3), or None."""
     if http_version == "1.0":
         return HTTPStatus.BAD_REQUEST, "Transfer-Encoding: HTTP/1.0 has none"
     if any(each != b"chunked" for each in codings):

@@ -56,7 +56,7 @@ def serve(settings: Settings) -> None:
 
 
 def _opened(settings: Settings) -> tuple[App, socket.socket | None]:
-    """Open the app, and the socket for probes."""
+    """The opened app, and the listening socket of the probe port, or None without such a port."""
     with ExitStack() as on_failure:
         app = open_app(settings, serving=True)
         on_failure.callback(app.close)

@@ -244,7 +244,11 @@ BAD = [
     (V2.replace("META_STOP", "USEABLE_START_TIME = 1997-001T00:00:00\nMETA_STOP"), "no useable"),
     (
         V2 + V2[V2.index("META_START") :].replace("074A", "075A"),
-        "must be the same in every segment",
+        "OBJECT_ID: must be the same in every segment",
+    ),
+    (
+        V2 + V2[V2.index("META_START") :].replace("OBJECT_NAME = ", "OBJECT_NAME = OTHER "),
+        "OBJECT_NAME: must be the same in every segment",
     ),
     (V2.replace("COMMENT a", "a"), "line 18: state: must have an epoch and 4 numbers"),
     (V2.replace("CREATION", "x" * 5000), "line 2: line: must have at most 4096 bytes"),

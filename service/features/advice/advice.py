@@ -8,6 +8,7 @@ settings.
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -268,7 +269,7 @@ def advise(
 
 @dataclass
 class _SampledBatches:
-    """Sampled batches that could be processed again, with their verified identification."""
+    """Sampled batches with their verified identification; counts of refused and mirrored ones."""
 
     cases: list[tuple[ObservationBatch, tuple[Identification, ...], TrialCounts]] = field(
         default_factory=list
@@ -292,22 +293,30 @@ def _trials(
     pace: WorkLimit,
 ) -> list[VariantOutcome]:
     present, by_probability, *others = variants(findings, own)
-    counts: dict[Variant, list[TrialCounts]] = {each: [] for each in (present, *others)}
+    at_present: list[TrialCounts] = []
+    # Star counts with a variant and, of the same batches, with the present settings.
+    counts: dict[Variant, tuple[list[TrialCounts], list[TrialCounts]]] = {
+        each: ([], []) for each in others
+    }
     for batch, sure, _ in sample.cases:
         if not pace.in_time(1.0):
             break
         try:
-            of_batch = {each: trial_counts(run(each.of(batch)), sure) for each in counts}
+            now = trial_counts(run(present.of(batch)), sure)
         except BadInput as error:
             sample.refuse(error)
         else:
-            for each, found in of_batch.items():
-                counts[each].append(found)
+            at_present.append(now)
+            for each, (tried, before) in counts.items():
+                # A batch that one variant refuses is left out of that one alone.
+                with suppress(BadInput):
+                    tried.append(trial_counts(run(each.of(batch)), sure))
+                    before.append(now)
         pace.step()
     return [
-        variant_outcome(present, counts[present], None),
+        variant_outcome(present, at_present, None),
         variant_outcome(by_probability, [found for *_, found in sample.cases], None),
-        *(variant_outcome(each, counts[each], counts[present]) for each in others),
+        *(variant_outcome(each, tried, before) for each, (tried, before) in counts.items()),
     ]
 
 

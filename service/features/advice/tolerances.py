@@ -33,7 +33,7 @@ Differences = Callable[[Evidence], tuple[Vector, npt.NDArray[np.int64]]]
 
 @dataclass(frozen=True)
 class Tolerance:
-    """Description of a tolerance: name, symbol, unit, test, limits, and bounded differences."""
+    """Description of a tolerance: names, unit, test, largest value, and differences it bounds."""
 
     name: str
     symbol: str

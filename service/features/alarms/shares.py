@@ -1,4 +1,4 @@
-"""Evaluation of limits on quantities that are measured once a day."""
+"""Evaluation of limits on a quantity of a whole UTC day, when the day is recorded."""
 
 from sqlalchemy import Connection
 

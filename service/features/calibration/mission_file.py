@@ -130,7 +130,7 @@ def _focal_plane(tracker: Tracker, bent: Mapping[Unknown, float]) -> Lines:
 def _polynomials_deg(
     bent: Mapping[Unknown, float], radius_deg: float
 ) -> tuple[dict[tuple[int, int], float], ...]:
-    """Polynomials to add to h and v, in degrees, as coefficients of powers of measured h and v."""
+    """Terms to add to h and v, in degrees: coefficients by their powers of measured h and v."""
     size = max((each.degree for each in bent), default=0) + 1
     series = np.zeros((2, size, size))
     for each, value in bent.items():

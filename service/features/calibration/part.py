@@ -1,4 +1,4 @@
-"""Service for calibrations: start, computation in the background, recording, trial and adoption."""
+"""Calibrations in the service: start, computation in the background, recording, adoption."""
 
 import logging
 import math

@@ -10,7 +10,7 @@ from service.web.requests.metrics import Metrics
 
 
 def check(settings: Settings) -> None:
-    """Do nothing: live filters and jobs have no settings, missions configure them."""
+    """Accept any settings of the service: missions configure live filters and jobs."""
 
 
 @asynccontextmanager

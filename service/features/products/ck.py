@@ -124,7 +124,7 @@ def instrument_id(about: attitudes.SeriesInfo) -> int:
 
 
 def clock_kernel(about: attitudes.SeriesInfo) -> str:
-    """Text of the spacecraft's clock kernel (SCLK)."""
+    """Text of a kernel (SCLK) of the service's own clock, for missions that name no clock."""
     id = -about.naif_id
     zero = f"{_CLOCK_ZERO_S + TT_LESS_TAI_S:.3f}"
     return text_kernel(

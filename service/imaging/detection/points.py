@@ -282,7 +282,7 @@ def _middles_of_trails(
 
 @dataclass(frozen=True)
 class ImageShapes:
-    """The place, width, ellipticity (0 to 1) and weighted light of each image.
+    """Shapes of star images as arrays (n,): places, widths, ellipticities (0 to 1), light.
 
     `drawn_out` is complex: its size is the ellipticity, its angle twice the direction of the longer
     axis from u towards v.

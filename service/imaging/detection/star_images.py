@@ -347,7 +347,7 @@ class ImageSearch:
         return len(images.stars) - before
 
     def _refit(self, images: StarImages, number: int) -> None:
-        """Fit one subtracted star again, with all others subtracted."""
+        """Fit one subtracted star again behind all others; unchanged if that fails or moves it."""
         star = images.stars[number]
         at = star.u_px, star.v_px
         window = images.behind(self._cutout(*at), number)

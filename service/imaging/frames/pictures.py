@@ -88,7 +88,7 @@ def _opened(file: BoundedFile, file_format: str) -> Any:
 
 
 def _is_plain(image: Any) -> bool:
-    """True if an image is a binary PGM or PPM, whose numbers Pillow would rescale.
+    """True if a picture that Pillow opened is a binary portable map, which this module decodes.
 
     Raises `BadFile` for colours in text with more than 8 bits, since Pillow keeps 8 of them.
     """

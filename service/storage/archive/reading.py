@@ -42,7 +42,7 @@ class PlacedPart:
 
 @dataclass(frozen=True)
 class Block:
-    """Row group of an archive part: the least that is opened."""
+    """Place of one row group, the least that is read of an archive part, with its time span."""
 
     part: PlacedPart
     group: int

@@ -266,7 +266,7 @@ class Opened:
 
     @property
     def nbytes(self) -> int:
-        """Memory used by the database in bytes."""
+        """Bytes of memory that this in-memory database of archived results takes."""
         with self.reading() as connection:
             pages, size = (
                 connection.exec_driver_sql(f"PRAGMA {name}").scalar_one()

@@ -160,7 +160,7 @@ class HeadMaker:
 
 
 NOTHING = Statement(number=0, previous="", made="", first=0, last=0, counts={}, root="")
-"""Statement that precedes the first head of the record."""
+"""Empty statement with the number 0, in the place before the first head of the record."""
 
 
 def last_head(connection: Connection) -> Statement:

@@ -94,7 +94,7 @@ class DayCounts:
 
 @dataclass(frozen=True)
 class FleetRow:
-    """State of one spacecraft in a run; most fields are None without a batch."""
+    """State of one spacecraft in a run; without a batch it has no times, attitude or counts."""
 
     name: str
     description: str

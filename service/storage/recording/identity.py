@@ -129,7 +129,7 @@ def _rows(connection: Connection, sql: str, wanted: Collection[object]) -> Seque
 def remember_keys(
     connection: Connection, keys: Sequence[tuple[Identity, OwnKey, ExistingResult]]
 ) -> list[AcquisitionError | None]:
-    """Assign Idempotency-Keys to bodies recorded without one; an error or None for each."""
+    """Store Idempotency-Keys for recorded results; an error for each that is taken, else None."""
     outcomes: list[AcquisitionError | None] = []
     for identity, key, taken in keys:
         holder = look_up(connection, (), [key]).holder(identity, key, taken.fingerprint)

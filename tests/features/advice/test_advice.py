@@ -19,6 +19,7 @@ from service.features.advice.statements import (
 from service.features.advice.text import advice_text
 from service.features.advice.tolerances import rounded_up, tolerance_findings
 from service.features.advice.trackers import alignment_findings, magnitude_findings, noise_findings
+from service.identify.voting import starid
 from service.missions.mission import Mission
 from service.simulate.stretches import NO_TROUBLES, Trouble, Troubles
 from service.storage.queries.results import BatchSample
@@ -413,6 +414,20 @@ def test_a_batch_that_no_longer_fits_is_counted_and_passed_by(sky, missions, see
     advice = advice_from(mission, sky, [*batches, *foreign])
     assert (advice.sampled, advice.refused) == (5, 1)
     assert "sun_pointed" in advice.refusal
+
+
+def test_a_tolerance_too_wide_to_be_tried_takes_no_batch_from_other_trials(
+    sky, missions, seed, monkeypatch
+):
+    monkeypatch.setattr(starid, "MAX_COMPARISONS", 2_000)
+    mission = missions["XTE"].model_copy(update={"identifier": "starid"})
+    batches = flown(mission, sky, 5, seed).batches
+    with_own = advice_from(mission, sky, batches, own={"separation_deg": 5.0})
+    *others, asked = with_own.trials
+    assert (with_own.sampled, with_own.refused, with_own.refusal) == (5, 0, None)
+    assert "asked for" in asked.variant.name
+    assert asked.batches == 0
+    assert {each.batches for each in others} == {5}
 
 
 def test_a_mirrored_sensor_is_suggested_only_beyond_chance(sky, missions, seed):

@@ -376,7 +376,7 @@ TRACKER_CHARTS = {"batches": "Batches in which the tracker disagrees with the ot
 
 
 def charts(tracker: str | None = None) -> list[dict[str, Any]]:
-    """Charts of every quantity that has a history, or that a tracker has."""
+    """Charts of all quantities with a history or, for a tracker, of those that trackers have."""
     shown = {name for _, _, names in CHARTS for name in names}
     others = [
         (name.replace("_", "-"), QUANTITIES[name].label.capitalize(), (name,))
