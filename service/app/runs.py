@@ -26,7 +26,6 @@ from service.times import Utc, utc_now
 
 MOST_COMPARED = 2_000
 """Largest number of batches compared for a page, which takes less than a second."""
-MOST_CHANGED = 50
 
 
 class Runs:
@@ -104,9 +103,7 @@ class Runs:
         place, archive = ResultFilter(run, spacecraft, start, end), self._context.store.archive
         with self._context.reading() as connection:
             found = compare_runs(connection, archive, place, other, MOST_COMPARED)
-            changed = changed_batches(
-                connection, archive, place, other, MOST_COMPARED, MOST_CHANGED
-            )
+            changed = changed_batches(connection, archive, place, other, MOST_COMPARED, 50)
         return found, changed
 
     def rates(

@@ -20,7 +20,6 @@ from service.storage.sql.projector_lock import left_behind
 from service.storage.store import Store
 from service.times import utc_now
 
-TRY_EVERY_S = 0.5
 RECOVER_EVERY_S = 2.0
 """Interval in seconds of the check for replays and calibrations without a service.
 
@@ -116,7 +115,7 @@ class SingleProjector:
         assert self._lock is not None
         while True:
             # A transaction may find out before this thread that the lock is lost.
-            self._lock.lost.wait(TRY_EVERY_S)
+            self._lock.lost.wait(0.5)
             if self._stopped.is_set():
                 return
             self._lock.lost.clear()

@@ -14,8 +14,6 @@ from service.missions.defaults import completed
 if TYPE_CHECKING:
     from service.missions.mission import Mission
 
-ORIGIN_COLUMN = 52
-
 
 def whole_text(mission: "Mission", path: Path) -> str:
     """Complete TOML text of a mission, with the origin of each value as a comment."""
@@ -72,7 +70,7 @@ def _table(name: str, table: Mapping[str, Any], origins: _Origins, prefix: str =
                 below += ["", f"[[{title}]]", *_table(title, each, origins, f"{dotted}.{place}.")]
         else:
             setting = f"{key} = {_value(value)}"
-            plain.append(f"{setting:<{ORIGIN_COLUMN}}  # {origins.of(dotted)}")
+            plain.append(f"{setting:<52}  # {origins.of(dotted)}")
     return plain + below
 
 

@@ -47,7 +47,6 @@ BLENDED_SHARE = 0.15
 A companion with the share r of the light shifts the star by 0.86 r sigma at most, at a distance of
 1.4 sigma; closer ones are merged in run catalogs too.
 """
-MAX_SHARP_KEPT = 500
 
 
 class FrameIn(schema.Wire):
@@ -292,7 +291,7 @@ def _record(
         background_counts=rounded_counts(float(np.median(found.background_counts)), 3),
         noise_counts=rounded_counts(found.noise_counts, 3),
         candidates=found.count,
-        sharp=[(round(u, 1), round(v, 1)) for u, v in sharp][:MAX_SHARP_KEPT],
+        sharp=[(round(u, 1), round(v, 1)) for u, v in sharp][:500],
         stars=[_star_fields(star) for star in stars],
         timings_us=timings_us,
         preview=preview,

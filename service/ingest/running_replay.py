@@ -215,7 +215,6 @@ def _shortened(text: str) -> str:
 
 
 BUSY_PAUSE_S = 0.5
-STOP_WITHIN_S = 0.2
 
 
 T = TypeVar("T")
@@ -480,7 +479,7 @@ class RunningReplay:
         while len(self._computing) > left:
             # Chunks of other replays may be computed first: a stopping replay does not wait for
             # them.
-            while not self._computing[0].chunk.is_computed(STOP_WITHIN_S):
+            while not self._computing[0].chunk.is_computed(0.2):
                 self.require_going_on()
             self._retry_while_busy(self._computing[0].chunk.queue_write)
             before, self._writing = self._writing, self._computing.popleft()

@@ -29,7 +29,6 @@ MANY_PAIRS = 300_000
 SIGMAS_ARCSEC = 0.1, 120.0
 SAME_BORESIGHT_DEG = 0.1
 COELEVATION_DEG = 0.5
-CORNER_SHARE = 0.05
 OTHER_SIGMA = 3.0
 """Ratio of the sigmas of a scan and its tracker, either way, above which they disagree."""
 
@@ -219,7 +218,7 @@ def _camera(key: str, tracker: Tracker) -> Iterator[Finding]:
             "places exceed their sigmas by amounts that are not known",
         )
     corner_deg, file_deg = tracker.camera.corner_radius_deg, tracker.field_of_view_radius_deg
-    if not math.isclose(corner_deg, file_deg, rel_tol=CORNER_SHARE):
+    if not math.isclose(corner_deg, file_deg, rel_tol=0.05):
         yield Finding(
             "unusual",
             f"{key}.field_of_view_radius_deg",

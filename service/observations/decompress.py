@@ -15,7 +15,6 @@ Coding = Literal["identity", "gzip", "zstd"]
 
 MAX_UNPACKED_BYTES = 64 << 30
 """Largest size of a decompressed body, more than any archive of telemetry."""
-MAX_WINDOW_BYTES = 128 << 20
 
 
 MAX_RATIO = 200
@@ -117,7 +116,7 @@ class _Zstd(io.RawIOBase):
         import zstandard
 
         self._file = file
-        self._unpacker = zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW_BYTES)
+        self._unpacker = zstandard.ZstdDecompressor(max_window_size=128 << 20)
         self._frame = self._unpacker.decompressobj()
         self._begun = False
         # A view, since repeated slicing of bytes would copy the rest each time.

@@ -95,11 +95,8 @@ def _not_csv(start: bytes) -> str | None:
     return "is no CSV but looks like NDJSON: name it .ndjson" if is_object else None
 
 
-_LOOKED_AT_LINES = 20
-
-
 def _not_ndjson(start: bytes) -> str | None:
-    lines = [line.strip() for line in start.split(b"\n") if line.strip()][:_LOOKED_AT_LINES]
+    lines = [line.strip() for line in start.split(b"\n") if line.strip()][:20]
     if lines[0] == b"{" or lines[0].startswith(b"["):
         return "is JSON, but not NDJSON, which has one batch a line and nothing around them"
     if any(line.startswith(b"{") for line in lines):

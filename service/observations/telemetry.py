@@ -18,7 +18,6 @@ from service.observations.input_formats import NDJSON, telemetry_format, telemet
 
 _LOOKED_AT_BYTES = 1 << 16
 _PACKED = {b"\x1f\x8b": ("gzip", "gunzip"), b"\x28\xb5\x2f\xfd": ("zstd", "unzstd")}
-_SHOWN_BYTES = 40
 
 
 def read_lines(source: Path | BinaryIO, form: str | None = None) -> Iterator[Line]:
@@ -46,7 +45,7 @@ def require_telemetry(path: Path, form: str | None = None, field: str | None = N
         start = stream.read(_LOOKED_AT_BYTES).removeprefix(codecs.BOM_UTF8)
     message = _not_telemetry(start, form)
     if message is not None:
-        shown = shown_value(start[:_SHOWN_BYTES]) if start.strip() else None
+        shown = shown_value(start[:40]) if start.strip() else None
         raise BadFile(Fault(field, message, shown))
     if form != NDJSON:
         try:

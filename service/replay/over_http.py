@@ -198,7 +198,6 @@ def _problem(problem: answers.Problem) -> Problem:
 # adds nothing, as with single posts.
 
 TIMEOUT_S = 120.0
-CANCEL_S = 10.0
 
 
 class _SentLines:
@@ -274,7 +273,7 @@ def replay_in_bulk(
             # A second Ctrl-C, or a service that is gone, must not be delayed by this request.
             with (
                 suppress(answers.ClientError),
-                Client(url, token, timeout_s=CANCEL_S, give_up_after_s=0.0) as canceller,
+                Client(url, token, timeout_s=10.0, give_up_after_s=0.0) as canceller,
             ):
                 canceller.cancel_replay(begun.id)
             raise

@@ -178,9 +178,6 @@ def _operation_id(route: APIRoute) -> str:
     return route.name
 
 
-TRY_AGAIN_S = 1.0
-
-
 async def report_to_supervisor(app: App) -> None:
     """Report readiness to systemd, and then liveness as often as the watchdog requires.
 
@@ -192,7 +189,7 @@ async def report_to_supervisor(app: App) -> None:
     # All threads of the handlers may be busy.
     own = anyio.CapacityLimiter(1)
     while not await anyio.to_thread.run_sync(_is_ready, app, limiter=own):
-        await asyncio.sleep(TRY_AGAIN_S)
+        await asyncio.sleep(1.0)
     notify_supervisor("READY=1\nSTATUS=ready")
     every_s = int(os.environ.get("WATCHDOG_USEC", "0")) / 2e6
     while every_s > 0.0:

@@ -52,7 +52,6 @@ USUAL_SHARE = 0.15
 """Normal share of batches with a priori errors beyond the zone, not reported as a cause."""
 OVER_SHARE, OVER_BATCHES = 0.1, 6
 """Last batches without a cause after which it is over: a share of all, but at least a number."""
-COMMON = 5
 
 Flags = npt.NDArray[np.bool_]
 
@@ -534,4 +533,4 @@ def _part(
 
 def common_rivals(now: StarTable) -> list[tuple[str, int]]:
     """Most frequent groups of rival catalog stars, with their numbers of ambiguous stars."""
-    return [(", ".join(names), n) for names, n in Counter(now.rivals).most_common(COMMON)]
+    return [(", ".join(names), n) for names, n in Counter(now.rivals).most_common(5)]

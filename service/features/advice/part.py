@@ -54,7 +54,6 @@ from service.times import DAY_S, Utc, recorded_utc, shifted, utc_now
 
 ADVICE_SAMPLE = 200
 """Default number of batches for advice: sigma accurate to about 5 %, processed in seconds."""
-ADVICE_RETRY_S = 10
 NO_TOLERANCES = TolerancesIn()
 CAUSES_SAMPLE = 300
 """Number of recorded batches per period read to find causes; takes less than half a second."""
@@ -196,7 +195,7 @@ class AdviceService:
             if reason is not None:
                 raise BadInput(Fault(f"tolerance {key}", f"{reason} and would change nothing"))
         if not self._lock.acquire(blocking=False):
-            raise Busy("the service is computing other advice", ADVICE_RETRY_S)
+            raise Busy("the service is computing other advice", 10)
         try:
             with self._context.reading() as connection:
                 selected = ResultFilter(run or LIVE, name, start, end)

@@ -20,7 +20,6 @@ Verdict = Literal["too_few", "fits", "too_small", "larger_than_needed"]
 
 LEAST_BATCHES = 50
 """Least number of recorded a priori errors: fewer show too little of the rare large ones."""
-USUAL_PERCENT = 90.0
 GROSS = 3.0
 """Multiple of the 90 % point above which an a priori error is a failure of its source."""
 RESERVE = 1.2
@@ -160,7 +159,7 @@ def _errors(
     if not angles_deg:
         return None
     angles = np.asarray(angles_deg)
-    median_deg, most_deg = np.percentile(angles, (50.0, USUAL_PERCENT)).tolist()
+    median_deg, most_deg = np.percentile(angles, (50.0, 90.0)).tolist()
     is_usual = angles <= GROSS * most_deg
     usual = angles[is_usual]
     certain = angles - CERTAIN_SIGMAS * np.asarray(sigmas_deg)

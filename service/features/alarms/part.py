@@ -173,7 +173,6 @@ class Alarms:
 PREVIEW_DAYS = 7
 MOST_PREVIEWED = 50_000
 """Greatest number of batches in one preview of a limit; reading them takes about a second."""
-MOST_EXCURSIONS = 50
 
 
 class Limits:
@@ -304,7 +303,7 @@ def _trial(
                 worst=each.worst,
                 bound=each.bound,
             )
-            for each in found.excursions[-MOST_EXCURSIONS:]
+            for each in found.excursions[-50:]
         ],
     )
 

@@ -29,7 +29,6 @@ SETTLED_S = LOOK_AHEAD_S + 600.0
 """Seconds after the end of a day until all data that its attitudes depend on are present."""
 LATE_DAYS = 3
 """Number of earlier days that a scheduled job computes again, for late batches."""
-LOOK_EVERY_S = 600.0
 
 
 @dataclass(frozen=True)
@@ -152,7 +151,7 @@ class DefinitiveJobs:
         return settings is not None and settings.daily
 
     def _keep_schedule(self) -> None:
-        while not self._stopped.wait(5.0 if not self._made else LOOK_EVERY_S):
+        while not self._stopped.wait(5.0 if not self._made else 600.0):
             if not self._context.store.is_projecting:
                 continue
             try:

@@ -48,7 +48,6 @@ from service.trends.quantities import REJECTED
 
 PARTS = 600
 """Number of equal parts of a period, with one sample each: the resolution of a chart."""
-MOST_DAYS = 40
 _SEVERITY = {Status.NONE: 3, Status.LOST: 3, Status.DOUBTFUL: 2, Status.STARTING: 1}
 
 
@@ -102,7 +101,7 @@ def definitive_period(
         innovations=_innovations(connection, _spread(measured), selected, start, end),
         is_whole=len(blocks) <= MOST_BLOCKS and len(measured) <= MOST_BLOCKS,
         stretches=[(each.model, each.start_ns, each.end_ns) for each in blocks],
-        days=[shown(row) for row in days[-MOST_DAYS:]],
+        days=[shown(row) for row in days[-40:]],
         total_days=len(days),
     )
 

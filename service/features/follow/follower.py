@@ -39,7 +39,6 @@ from service.gyro.blocks import is_gyro_line
 ACK_WAIT_S = 30.0
 """Seconds without a sign of life after which NATS delivers a message to another follower."""
 BEAT_S = 10.0
-FETCH_S = 1.0
 PAUSE_S = 1
 BEGIN_AGAIN_S = 5.0
 TRIES = 5
@@ -48,7 +47,6 @@ UNKEPT_S = 60.0
 """Seconds before a follower asks again whether a stream keeps a subject."""
 MESSAGE_TOO_LARGE = 10_054
 """NATS error code for a message larger than a stream accepts."""
-STATE_EVERY_S = 5.0
 SEQUENCE, DELIVERED = "Acquire-Sequence", "Acquire-Delivered"
 """Headers of refusals and answers: the message's number in its stream, and its deliveries."""
 
@@ -170,9 +168,7 @@ class Follower:
             try:
                 while not self._stopped.is_set():
                     try:
-                        fetched = await subscription.fetch(
-                            self._source.concurrency, timeout=FETCH_S
-                        )
+                        fetched = await subscription.fetch(self._source.concurrency, timeout=1.0)
                     except TimeoutError:
                         if await self._is_empty(stream) and until_empty:
                             return
@@ -296,7 +292,7 @@ class Follower:
                 self._metrics.set_lag(info.num_pending or 0)
                 self._forget_failures(info)
             self._progress(self._metrics)
-            await asyncio.sleep(STATE_EVERY_S)
+            await asyncio.sleep(5.0)
 
     def _forget_failures(self, info: ConsumerInfo) -> None:
         """Drop failure counts of messages that another follower has settled."""

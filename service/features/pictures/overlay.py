@@ -16,7 +16,6 @@ BLACK_SIGMAS, BEND_SIGMAS, WHITE_SIGMAS = -0.5, 3.0, 300.0
 STEPS_DEG = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 15.0, 30.0)
 GRID_LINES = 4.0
 """Approximate number of grid lines across the shorter side."""
-MOST_LABELS = 60
 _GRID, _STAR, _CANDIDATE, _TEXT = (60, 90, 130), (90, 220, 120), (150, 120, 70), (230, 230, 230)
 Box = tuple[float, float, float, float]
 
@@ -46,7 +45,7 @@ def overlay_of(result: PictureResult, title: str) -> bytes:
     if found is not None:
         for star in found.stars:
             pen.circle(star.u_px, star.v_px, 8.0, _STAR)
-        for star in found.stars[:MOST_LABELS]:
+        for star in found.stars[:60]:
             pen.label(star.u_px, star.v_px, star.name or star.id, 9.0, _STAR)
         _draw_scale(pen, found.field_deg[0])
         (ra_deg, dec_deg), (width_deg, height_deg) = found.boresight_deg, found.field_deg

@@ -113,7 +113,6 @@ def identity(about: attitudes.SeriesInfo) -> Pairs:
 TRACKER_FRAME = "STARTRACKER_1"
 COUNTS = ("OBSERVED", "UNIQUE", "AMBIGUOUS", "UNMATCHED")
 """Keywords of the star counts of all batches, in the order of `AttitudeRows.stars`."""
-_ARCSEC2_IN_DEG2 = 3600.0**2
 _DESIGNATOR = re.compile(r"\d{4}-\d{3}[A-Z]{1,3}")
 
 
@@ -205,7 +204,7 @@ def _variances_deg2(about: attitudes.SeriesInfo, part: attitudes.AttitudeBlock) 
     if len(about.trackers) == 1:
         axes = np.array(about.trackers[0].body_from_tracker)
         p = axes.T @ p @ axes
-    return np.asarray(np.diagonal(p, axis1=1, axis2=2) / _ARCSEC2_IN_DEG2)
+    return np.asarray(np.diagonal(p, axis1=1, axis2=2) / 3600.0**2)
 
 
 def _determination(about: attitudes.SeriesInfo, methods: Counter[str]) -> str:

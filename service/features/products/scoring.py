@@ -17,7 +17,6 @@ from service.vectors import ARCSEC_PER_RADIAN, Vector, full_matrices, rotation_v
 
 AXES = ("x", "y", "z")
 _SHARES = (50.0, 95.0, 99.0)
-BINS = 40
 
 
 @dataclass(frozen=True)
@@ -94,7 +93,7 @@ def histogram(errors: Errors) -> dict[str, Any]:
     The limit holds 99 of 100 errors, so that outliers do not compress the rest.
     """
     limit = float(np.percentile(np.abs(errors.error_arcsec), _SHARES[-1])) or 1.0
-    edges = np.linspace(-limit, limit, BINS + 1)
+    edges = np.linspace(-limit, limit, 41)
     clipped = errors.error_arcsec.clip(-limit, limit)
     counts = {
         axis: np.histogram(column, edges)[0].tolist()

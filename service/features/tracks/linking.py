@@ -201,8 +201,6 @@ Marks = npt.NDArray[np.bool_]
 # direction, dr and dq of the rate, and w is the rate.  These are linear, so that a few rounds of
 # weighted least squares settle.
 
-_FIT_ROUNDS = 4
-
 
 @dataclass(frozen=True, eq=False)
 class Motion:
@@ -263,7 +261,7 @@ def fit_motion(time_s: Vector, direction: Vector, covariance: Vector, *, moves: 
         rate = elapsed @ direction / (elapsed @ elapsed)
         place = unit(place + rate * (middle - float(time_s.mean())))
         rate = rate - (rate @ place) * place
-    for _ in range(_FIT_ROUNDS):
+    for _ in range(4):
         axes = _axes(place, rate)
         step, normal, left = _step(
             Motion(middle, place, rate, axes, np.eye(4), 0.0, 0),

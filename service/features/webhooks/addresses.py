@@ -45,7 +45,6 @@ NO_WEB_PORTS = frozenset(
 ) | frozenset(range(6665, 6670))
 """Ports above 1023 that browsers block as well (WHATWG Fetch, "bad port")."""
 MAX_URL = 2_000
-MAX_ADDRESSES = 8
 RESOLVE_S = 3.0
 """Time limit in seconds for resolving a host name when a webhook is registered."""
 MAX_LOOK_UPS = 64
@@ -154,7 +153,7 @@ async def reachable_addresses(
     found = [str(literal)] if literal is not None else await _look_up(host, port)
     for each in found:
         require_reachable(ipaddress.ip_address(each), allowed, only_allowed=only_allowed)
-    return found[:MAX_ADDRESSES]
+    return found[:8]
 
 
 def _is_web_port(port: int) -> bool:

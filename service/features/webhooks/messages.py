@@ -124,12 +124,11 @@ def test_message(id: str, now: str) -> tuple[str, bytes]:
 
 
 PREFIX = "whsec_"
-SECRET_BYTES = 32
 
 
 def new_webhook_secret() -> str:
     """Create a random signing secret, in the form shown to receivers."""
-    return PREFIX + base64.b64encode(secrets.token_bytes(SECRET_BYTES)).decode()
+    return PREFIX + base64.b64encode(secrets.token_bytes(32)).decode()
 
 
 def signed_headers(

@@ -13,7 +13,6 @@ from service.features.webhooks.messages import TOTAL_S, Outcome
 from service.settings import Network
 
 MAX_ANSWER_BYTES = 64 << 10
-MAX_FAULT = 300
 PORTS = {"http": 80, "https": 443}
 
 
@@ -116,7 +115,7 @@ class Poster:
         except (OSError, httpx.InvalidURL, ValueError) as error:
             fault = f"the name cannot be resolved: {error}"
         if fault is not None:
-            fault = fault[:MAX_FAULT].replace("\x00", "")
+            fault = fault[:300].replace("\x00", "")
         return Outcome(status, fault, retry_after_s, time.monotonic() - begun_s)
 
     async def close(self) -> None:

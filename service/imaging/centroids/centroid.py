@@ -42,7 +42,6 @@ from service.imaging.centroids.window import (
 )
 from service.observations.scans.lines import BREAKDOWN_RATIO, ProfileMoment, moment
 
-MOST_MOVES = 10
 MOST_SHARE = 0.9
 SLOPE_LEAST = 0.2
 """Least slope of a moment against the star's place: less means outside the image's core."""
@@ -70,7 +69,7 @@ def by_moments(
     one refuses the star. Near the edge the square shrinks, to stay symmetric about the star.
     """
     column, row = start
-    for iterations in range(1, MOST_MOVES + 1):
+    for iterations in range(1, 11):
         region = symmetric_square_about(window, column, row, half_width_px)
         if region is None:
             # Only a window cut by the edge of the frame leaves no room for a square.
@@ -242,7 +241,6 @@ def is_blended(found: Fit, psf: Psf) -> bool:
 
 Method = Literal["window", "scan", "matched", "recursive"]
 METHODS: Sequence[Method] = ("window", "scan", "matched", "recursive")
-DEFAULT_HALF_WIDTH_PX = 4
 
 
 def centroid(
@@ -250,7 +248,7 @@ def centroid(
     method: Method = "matched",
     psf: Psf | None = None,
     start: tuple[float, float] | None = None,
-    half_width_px: int = DEFAULT_HALF_WIDTH_PX,
+    half_width_px: int = 4,
     recentre: bool = True,
 ) -> CentroidRecord:
     """The position of the star in a window by one of four methods, with predicted sigmas and flags.

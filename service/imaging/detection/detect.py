@@ -34,7 +34,6 @@ FINE_MESH_PX = 16
 FINE_MESH_SIGMAS = 12.0
 """Least side of a fine background mesh, in widths of a star's image."""
 MOST_FINE_MESH_PX = 32
-FINE_ROUNDS = 2
 UNEVEN, UNEVEN_SHARE = 0.5, 0.005
 """Residual level of a coarse mesh, in sigmas of noise, that is taken for stray light, and the least
 share of such meshes that starts the fine meshes. On even frames a few meshes have 0.3 sigmas.
@@ -68,7 +67,7 @@ def take_background_off(
     fine = max(FINE_MESH_PX, 8 * math.ceil(FINE_MESH_SIGMAS * psf_sigma_px / 8.0))
     fits = fine <= MOST_FINE_MESH_PX and min(light.shape) >= MESH_PX
     if fits and np.count_nonzero(uneven) > UNEVEN_SHARE * uneven.size:
-        for _ in range(FINE_ROUNDS):
+        for _ in range(2):
             level += _take_fine_off(light, mask, fine)
         noise = _noise_by_blocks(light, mask, fine, step_counts)
     # Where most pixels are equal, as in a frame clipped at its background, the noise is set to one

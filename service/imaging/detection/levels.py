@@ -13,7 +13,6 @@ from service.imaging.frames.frame import CountArray
 
 _SAMPLES = 1 << 16
 _FEW_LEVELS = 4
-_LEVELS_OF_8_BITS = 255.0
 _ROUNDING_BITS = 20
 """Bits below the largest count at which single-precision transforms have rounding errors."""
 _LEAST_RANGE, _MOST_RANGE = 2.0**-10, 2.0**40
@@ -84,5 +83,5 @@ def _sampled(counts: CountArray) -> tuple[CountArray, float, float]:
 def _step(levels: CountArray, least: float, most: float) -> float:
     span = most - least
     if len(levels) < _FEW_LEVELS:
-        return span / _LEVELS_OF_8_BITS
+        return span / 255.0
     return max(float(np.diff(levels).min()), span * 2.0**-_ROUNDING_BITS)

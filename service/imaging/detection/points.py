@@ -60,7 +60,6 @@ TRAIL_PEAKS, TRAIL_WEIGHT_PX, TRAIL_ROUNDS = 30, 3.0, 2
 """Number of the clearest peaks, width of the weight, and centroid rounds, used to detect trails."""
 _LEAST_SIGMA_PX = 0.01
 """Least standard deviation of a place: the pixels of a sensor are no more even than that."""
-_CENTROID_ROUNDS = 6
 
 
 @dataclass(frozen=True)
@@ -422,7 +421,7 @@ def image_moments(
     u: npt.NDArray[np.int64],
     v: npt.NDArray[np.int64],
     weight_px: float,
-    rounds: int = _CENTROID_ROUNDS,
+    rounds: int = 6,
 ) -> ImageShapes:
     """Centroids and second moments of images under a Gaussian weight that follows each image."""
     half = max(3, math.ceil(3.0 * weight_px))

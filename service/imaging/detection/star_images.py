@@ -41,7 +41,6 @@ AIRY_OVER_SIGMA = 2.29
 REACH_OVER_AIRY = 45.0
 """Radius of a computed diffraction image, in lambda f / D: two nulls of a wire a tenth wide."""
 LEAST_REACH_PX, MOST_REACH_PX = 48, 160
-GAUSSIAN_REACH_PX = 8
 CORE_SIGMAS = 3.0
 COLOURS = 61
 """Number of wavelengths in the sum over a band."""
@@ -53,7 +52,7 @@ SHORT_TRAIL_PX = 0.1
 def reach_px(camera: Camera) -> int:
     """The radius in whole pixels to which a star's image is drawn and subtracted."""
     if camera.psf == "gaussian":
-        return GAUSSIAN_REACH_PX
+        return 8
     reach = math.ceil(REACH_OVER_AIRY * AIRY_OVER_SIGMA * camera.psf_sigma_px)
     return min(max(reach, LEAST_REACH_PX), MOST_REACH_PX)
 

@@ -30,7 +30,6 @@ _HEADERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
 }
-_MAX_HEADER = 4096
 COLOURS = 3
 
 
@@ -43,7 +42,7 @@ def read_npy(file: BoundedFile, limits: FrameLimits, digest: str) -> Frame:
         version = np.lib.format.read_magic(file)
         if version not in _HEADERS:
             raise bad_frame("is of a .npy version that frames do not need", str(version))
-        shape, by_column, dtype = _HEADERS[version](file, max_header_size=_MAX_HEADER)
+        shape, by_column, dtype = _HEADERS[version](file, max_header_size=4096)
     except BadFile:
         raise
     except Exception as error:

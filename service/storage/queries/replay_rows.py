@@ -12,7 +12,6 @@ from service.errors import NotFound, WrongState, shown_value
 from service.storage.recording import events
 from service.storage.sql.tables import replays, rollups_daily
 
-MAX_LISTED = 100
 CANCELLED: runs.ReplayStateName = "cancelled"
 UNFINISHED: tuple[runs.ReplayStateName, ...] = ("running", "waiting")
 _NO_GYRO = {"gyro_blocks": 0, "gyro_samples": 0}
@@ -41,7 +40,7 @@ def list_replays(
 
     With `spacecraft`, only replays into runs whose batches are all of these.
     """
-    query = select(replays).order_by(replays.c.id.desc()).limit(MAX_LISTED)
+    query = select(replays).order_by(replays.c.id.desc()).limit(100)
     if spacecraft is not None:
         batches = rollups_daily.c
         own = select(batches.run).where(batches.spacecraft.in_(spacecraft))

@@ -258,7 +258,6 @@ def _add_annotation_event(connection: Connection, shown: Annotation, *, deleted:
 CHANNEL = "acquire_events"
 WAIT_S = 0.5
 """Seconds between two checks whether the listening thread should end."""
-RECONNECT_S = 1.0
 
 
 class HeardEvents:
@@ -302,4 +301,4 @@ class HeardEvents:
                             self._bell.ring()
             except (SQLAlchemyError, psycopg.Error) as error:
                 log.info("events of other services are read each second: %s", error)
-                self._closed.wait(RECONNECT_S)
+                self._closed.wait(1.0)

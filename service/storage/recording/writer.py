@@ -40,7 +40,6 @@ WriteOutcome = RecordOutcome | Exception
 WriteOutcomes = list[WriteOutcome]
 
 MAX_ATTEMPTS = 5
-MAX_LOOKS = 5
 RETRY_AFTER_S = 5
 
 # PostgreSQL's codes for two transactions in conflict; the one that it stopped starts again.
@@ -344,7 +343,7 @@ class Writer:
 def _record(connection: Connection, unsaved_results: Sequence[UnsavedResult]) -> WriteOutcomes:
     """Record all results together; after an error one by one, so that one fails no other."""
     failure: Exception
-    for _ in range(MAX_LOOKS):
+    for _ in range(5):
         try:
             with _savepoint(connection):
                 return list(record(connection, unsaved_results))

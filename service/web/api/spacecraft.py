@@ -23,8 +23,6 @@ from service.web.requests.query_parameters import FromQuery, SpacecraftPath
 
 router = ApiRouter("spacecraft")
 
-DEFAULT_SIZE = 500
-
 
 @ClientMethod(
     "fleet",
@@ -170,7 +168,7 @@ def get_history(
         name,
         quantities=query.quantity,
         strategy=query.strategy or "minmax",
-        size=query.size or DEFAULT_SIZE,
+        size=query.size or 500,
         tracker=query.tracker,
         **where,
     )

@@ -14,8 +14,6 @@ from service.web.requests.request_body import JsonBody, read_model
 
 router = ApiRouter("zones")
 
-MAX_WARMED = 1000
-
 
 class WarmIn(Wire):
     """Request body that selects zones to build before a batch needs them."""
@@ -24,7 +22,7 @@ class WarmIn(Wire):
     time: Annotated[
         Time, Field(description="UTC; determines the epoch and the direction of the Sun.")
     ]
-    a_priori: Annotated[list[APrioriIn], Field(min_length=1, max_length=MAX_WARMED)]
+    a_priori: Annotated[list[APrioriIn], Field(min_length=1, max_length=1000)]
 
 
 class DropQuery(Query):

@@ -25,8 +25,6 @@ from service.times import Utc, parse_utc
 from service.trends.quantities import OneOf, QuantityName, RankedName, trend_names
 from service.web.requests.request_body import require_no_query
 
-MAX_LIMIT = 500
-
 T = TypeVar("T")
 FromQuery: TypeAlias = Annotated[T, InQuery()]
 """Annotation of a model whose fields are the query parameters of a route."""
@@ -56,9 +54,7 @@ RunOrAll = Annotated[
 ]
 Start = Annotated[Time | None, Field(description="Start of the period, included.")]
 End = Annotated[Time | None, Field(description="End of the period, excluded.")]
-PageLimit = Annotated[
-    int, Field(ge=1, le=MAX_LIMIT, description="Maximum number of items on a page.")
-]
+PageLimit = Annotated[int, Field(ge=1, le=500, description="Maximum number of items on a page.")]
 Cursor = Annotated[
     str | None,
     Field(

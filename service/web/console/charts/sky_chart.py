@@ -14,13 +14,11 @@ from service.storage.queries.star_field import Boresight, ObservedStarPlace, Tra
 
 SIZE = 640
 """Width and height of the picture, in pixels."""
-FIELD_MARGIN = 1.12
 LONGEST_ARROW = 70.0
 """Length of the longest residual arrow, in pixels."""
 ROUND = (1.0, 2.0, 5.0)
 MARK_RADIUS = 13.0
 """Radius of the mark about an observed star; a triangle's corners reach slightly farther."""
-RIVAL_MARGIN = 6.0
 
 
 # Positions of numbers and names in the picture of a star field, without overlaps.
@@ -268,7 +266,7 @@ def sky_chart(tracker: TrackerField, through: str, view: str = "all") -> SkyChar
     """
     field_deg = tracker.field_of_view_radius_deg
     limit_mag = tracker.magnitude_limit_mag
-    projection = _Projection(tracker.radius_deg if view == "all" else field_deg * FIELD_MARGIN)
+    projection = _Projection(tracker.radius_deg if view == "all" else field_deg * 1.12)
     catalog = _catalog_stars(tracker, projection)
     named = [star for star in catalog if star.role != "none"]
     places = [projection.place(each.h_deg, each.v_deg) for each in tracker.observed]
@@ -282,7 +280,7 @@ def sky_chart(tracker: TrackerField, through: str, view: str = "all") -> SkyChar
     labels = Labels(
         SIZE,
         marks=[(x, y, MARK_RADIUS) for x, y in places]
-        + [(star.x, star.y, star.radius + RIVAL_MARGIN) for star in named],
+        + [(star.x, star.y, star.radius + 6.0) for star in named],
         taken=[*AXES, *(text_box(each.label, *each.label_at) for each in rings)],
         lines=[
             point

@@ -11,7 +11,6 @@ from service.web.console.page import ContextDep, FromQuery, PeriodQuery, console
 from service.web.requests.access import Policy
 from service.web.requests.query_parameters import Cursor
 
-ANNOTATION_ROWS = 50
 AROUND_S = 1800.0
 """Seconds before and after an annotation in the linked trends."""
 
@@ -30,7 +29,7 @@ def annotations_page(query: FromQuery[AnnotationsQuery], context: ContextDep) ->
     page = context.app.annotations.page(
         spacecraft=query.spacecraft or None,
         **query.bounds,
-        limit=ANNOTATION_ROWS,
+        limit=50,
         cursor=query.cursor,
     )
     return context.rendered(
