@@ -15,10 +15,10 @@ from service.features.alarms.records import AlarmWithActions
 from service.features.alarms.state import TimeOut
 from service.observations.schema import Key
 from service.storage.queries.fleet import present_rank
-from service.times import Utc, recorded_utc, shifted
-from service.trends.limits import Severity
+from service.times import DAY_S, Utc, recorded_utc, shifted
+from service.trends.limits import LimitSettings, Severity
 from service.trends.quantities import limited_trackers, quantity_named, trend_names
-from service.web.console.formatting import second_after, with_day_of_year
+from service.web.console.formatting import age, second_after, with_day_of_year
 from service.web.console.page import (
     ContextDep,
     FromQuery,
@@ -63,6 +63,8 @@ MARGIN_S = 1800.0
 TREND_BEFORE_S = 4 * 3600.0
 TOGETHER_S = 1800.0
 """Seconds within which alarms that leave their limits are assumed to share a cause."""
+FLEET_TOGETHER_S = 600.0
+"""The same for alarms of several spacecraft."""
 
 
 class AlarmsQuery(SortedQuery):
@@ -82,6 +84,8 @@ class AlarmLine:
 
     alarm: Alarm
     times: list[TimeOut]
+    bound: float
+    """Bound of the severity now; of the worst one if the value is back in limits."""
 
     @property
     def last(self) -> TimeOut:
@@ -114,11 +118,7 @@ def alarms_page(query: FromQuery[AlarmsQuery], context: ContextDep) -> Response:
     """Console page with the alarms of a run, the latest violation first."""
     query = query.model_copy(update={"spacecraft": context.listed(query.spacecraft)})
     found, next_cursor = _found(context, query)
-    lines = [
-        AlarmLine(alarm, times)
-        for alarm, times in zip(found, context.app.part(Alarms).times_out(found), strict=True)
-    ]
-    lines = _sorted(lines, query)
+    lines = _sorted(_lines(context, found), query)
     return context.rendered(
         "alarms.html.jinja",
         query.run,
@@ -132,6 +132,11 @@ def alarms_page(query: FromQuery[AlarmsQuery], context: ContextDep) -> Response:
         spacecraft=context.spacecraft,
         is_retired=context.app.part(Alarms).is_retired,
     )
+
+
+def _lines(context: PageContext, found: list[Alarm]) -> list[AlarmLine]:
+    part = context.app.part(Alarms)
+    return list(map(AlarmLine, found, part.times_out(found), part.present_bounds(found)))
 
 
 def _found(context: PageContext, query: AlarmsQuery) -> tuple[list[Alarm], str | None]:
@@ -222,20 +227,22 @@ def alarm_page(id: str, query: FromQuery[AlarmQuery], context: ContextDep) -> Re
         # Same answer as for an unknown id: probing must not reveal alarms of other spacecraft.
         raise NotFound(f"there is no alarm with the id {shown_value(id)}")
     is_retired = context.app.part(Alarms).is_retired(alarm.spacecraft, alarm.tracker)
-    (times,) = context.app.part(Alarms).times_out([alarm])
+    (line,) = _lines(context, [alarm])
+    start = shifted(recorded_utc(alarm.raised.time), -MARGIN_S)
+    end = shifted(recorded_utc(line.last[1] or alarm.latest.time), MARGIN_S)
+    trend = _trend(context, alarm)
     return context.rendered(
         "alarm.html.jinja",
         alarm.run,
         alarm=alarm,
-        line=AlarmLine(alarm, times),
+        line=line,
         is_retired=is_retired,
         cause=quantity_named(alarm.quantity).cause,
         related=_related(context, alarm),
-        trend=_trend(context, alarm),
-        period={
-            "start": shifted(recorded_utc(alarm.raised.time), -MARGIN_S).text,
-            "end": shifted(recorded_utc(times[-1][1] or alarm.latest.time), MARGIN_S).text,
-        },
+        trend=trend,
+        means=_means(context, alarm, trend),
+        period={"start": start.text, "end": end.text},
+        before="day" if end.tai_ns - start.tai_ns <= DAY_S * 1e9 else "week",
         of_tracker={"tracker": alarm.tracker} if _has_tracker(context, alarm) else {},
     )
 
@@ -254,23 +261,53 @@ def _end(alarm: Alarm) -> Utc:
     return max(after, latest, key=lambda moment: moment.tai_ns)
 
 
-def _related(context: PageContext, alarm: AlarmWithActions) -> list[Alarm]:
-    """Active alarms that may share a cause with another alarm.
+def _related(context: PageContext, alarm: AlarmWithActions) -> list[tuple[Alarm, str]]:
+    """Active alarms that may share a cause with another alarm, each with the reason.
 
-    The same quantity of other spacecraft, and other quantities of this one that
-    left their limits at about the same time.
+    The same quantity of other spacecraft, and other quantities of this one, if they left their
+    limits at about the same time; and others of the same tracker.
     """
     raised_ns = recorded_utc(alarm.raised.time).tai_ns
 
-    def is_related(other: Alarm) -> bool:
-        if other.id == alarm.id or not context.caller.may_see(other.spacecraft):
-            return False
-        if other.spacecraft != alarm.spacecraft:
-            return other.quantity == alarm.quantity
-        apart_ns = abs(recorded_utc(other.raised.time).tai_ns - raised_ns)
-        return apart_ns <= TOGETHER_S * 1e9
+    def reason(other: Alarm) -> str:
+        is_same = other.spacecraft == alarm.spacecraft
+        apart_s = abs(recorded_utc(other.raised.time).tai_ns - raised_ns) * 1e-9
+        is_together = apart_s <= (TOGETHER_S if is_same else FLEET_TOGETHER_S)
+        if is_together and (is_same or other.quantity == alarm.quantity):
+            what = "same spacecraft" if is_same else "same quantity"
+            return f"{what}, raised {age(apart_s)} apart" if apart_s else f"{what}, same time"
+        is_tracker = is_same and other.tracker == alarm.tracker is not None
+        return "same tracker" if is_tracker else ""
 
-    return [other for other in context.app.part(Alarms).active(alarm.run) if is_related(other)]
+    others = [
+        (other, reason(other))
+        for other in context.app.part(Alarms).active(alarm.run)
+        if other.id != alarm.id and context.caller.may_see(other.spacecraft)
+    ]
+    return [each for each in others if each[1]]
+
+
+@dataclass(frozen=True)
+class AlarmMeans:
+    """Number of batches whose mean each value of an alarm is; one if the limit was changed since.
+
+    `worst` has the batch that contributed most to the raised, worst and latest value, if known.
+    """
+
+    count: int
+    worst: dict[str, str]
+
+
+def _means(context: PageContext, alarm: Alarm, trend: "AlarmTrend | None") -> AlarmMeans:
+    part = context.app.part(Alarms)
+    for limit in trend.limits if trend else ():
+        settings = LimitSettings.model_validate(limit.settings)
+        worst = part.largest_contributions(alarm, settings)
+        # A tracker's limit may be that of its spacecraft.
+        whole = part.limits.get(alarm.spacecraft, alarm.quantity).limit
+        if worst or max(limit.since or "", whole.since or "") <= alarm.raised.at:
+            return AlarmMeans(settings.minimum_count, worst)
+    return AlarmMeans(1, {})
 
 
 @dataclass(frozen=True)

@@ -12,15 +12,21 @@ from service.errors import BadBatch, Fault, shown_value
 from service.features.alarms import records, state, state_machine
 from service.features.alarms.projection import evaluate_by_clock, is_due_by_clock
 from service.features.alarms.state import StateFilter, TimeOut, alarm_spans, list_alarms, times_out
-from service.features.alarms.windows import Preview, preview_of, preview_of_gaps
+from service.features.alarms.windows import (
+    Point,
+    Preview,
+    largest_contribution,
+    preview_of,
+    preview_of_gaps,
+)
 from service.missions.mission import Mission, mission_named
 from service.observations.schema import LIVE
 from service.storage.queries.definitive import rejected_samples
 from service.storage.queries.pages import ResultFilter, latest_time
-from service.storage.queries.trends import latest_samples
+from service.storage.queries.trends import latest_samples, samples_until
 from service.storage.sql.columns import Row
 from service.times import DAY_S, Utc, shifted, utc_now
-from service.trends.limits import LimitSettings, Sample
+from service.trends.limits import Bounds, LimitSettings, Sample, Severity
 from service.trends.quantities import (
     REJECTED,
     SILENCE,
@@ -85,6 +91,33 @@ class Alarms:
         """An alarm with the actions recorded for it."""
         with self._context.reading() as connection:
             return state.read_alarm(connection, known_id(id, "alarm"), utc_now().text)
+
+    def present_bounds(self, found: Sequence[Alarm]) -> list[float]:
+        """Bound of the present severity of each alarm; of the worst one where that is not known."""
+        missions = self._context.missions
+        eased = {a.spacecraft for a in found if a.current_severity not in (None, a.severity)}
+        with self._context.reading() as connection:
+            limits = {
+                name: state.limits_of(connection, missions[name])
+                for name in eased & missions.keys()
+            }
+        return [_present_bound(alarm, limits.get(alarm.spacecraft, {})) for alarm in found]
+
+    def largest_contributions(self, alarm: Alarm, limits: LimitSettings) -> dict[str, str]:
+        """Ids of the batches that contributed most to the raised, worst and latest mean."""
+        subject, count = subject_of(alarm.quantity, alarm.tracker or ""), limits.minimum_count
+        found = {}
+        with self._context.reading() as connection:
+            for which in ("raised", "worst", "latest"):
+                value = getattr(alarm, which)
+                if value.batch_id is None or count == 1:
+                    continue
+                point = Point(value.value, value.time, value.batch_id)
+                # Batches without a value are not part of a window.
+                recorded = samples_until(connection, value.batch_id, subject, 10 * count)
+                if batch_id := largest_contribution(point, recorded, limits):
+                    found[which] = batch_id
+        return found
 
     def is_retired(self, spacecraft: str, tracker: str | None) -> bool:
         """True if no loaded mission has the spacecraft, or the tracker with its own limits."""
@@ -168,6 +201,16 @@ class Alarms:
             ),
             entry,
         )
+
+
+def _present_bound(alarm: Alarm, limits: state.LimitsInForce) -> float:
+    settings = limits.get(subject_of(alarm.quantity, alarm.tracker or ""))
+    if settings is None or alarm.current_severity in (None, alarm.severity):
+        return alarm.raised.bound
+    severity = Severity[alarm.current_severity.upper()]
+    # The limits may have been changed since: then the severity may have no bound.
+    has_bound = settings.bounds(severity) != Bounds()
+    return settings.bound(severity, alarm.latest.value) if has_bound else alarm.raised.bound
 
 
 PREVIEW_DAYS = 7

@@ -9,10 +9,12 @@ from bisect import insort
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate, pairwise
+from math import isclose
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from service.storage.queries.trends import RecordedSample
 from service.trends.limits import LimitSettings, Sample, Severity
 from service.vectors import Vector
 
@@ -148,6 +150,36 @@ class SampleWindow:
             Severity[word.upper()]: Point(*each) for word, each in kept.get("worst", {}).items()
         }
         return cls([tuple(each) for each in kept["samples"]], since_ns, worst)
+
+
+def largest_contribution(
+    point: Point, recorded: Sequence[RecordedSample], limits: LimitSettings
+) -> str | None:
+    """Id of the batch that moved a mean furthest towards its bound; None if the batches of the mean
+    are not known, or all of them are zero.
+
+    `recorded` are batches up to that of the point.  Some may have arrived after its evaluation, so
+    the batches known at each arrival are tried; those with the mean of the point are its window.
+    """
+    low, high = limits.inner_bounds
+    sign = -1.0 if low - point.value > point.value - high else 1.0
+
+    def pull(each: RecordedSample) -> tuple[float, float, RecordedSample]:
+        # Of equal numbers of stars the greater share counts, of equal shares the latest.
+        _, part, whole = each.sample
+        return sign * part, sign * part / whole, each
+
+    begun = [each.seq for each in recorded if each.batch_id == point.batch_id]
+    for seq in sorted({each.seq for each in recorded if begun and each.seq >= begun[0]}):
+        known = sorted((each for each in recorded if each.seq <= seq), reverse=True)
+        window = known[: limits.minimum_count]
+        mean = sum(part for (_, part, _), *_ in window) / sum(whole for (_, _, whole), *_ in window)
+        if len(window) == limits.minimum_count and isclose(
+            mean, point.value, rel_tol=SLACK, abs_tol=SLACK
+        ):
+            worst = max(window, key=pull)
+            return None if sign > 0.0 and not worst.sample[1] else worst.batch_id
+    return None
 
 
 def _each_within(samples: Sequence[Sample], limits: LimitSettings) -> bool:

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -445,6 +445,47 @@ def _shown(
         values = {row["id"]: dict(row) for row in connection.execute(own).mappings()}
     value_of: Any = QUANTITIES[by].value_of
     return [RankedBatch(**summary_fields(rows[id]), value=value_of(values[id])) for id in ids]
+
+
+class RecordedSample(NamedTuple):
+    """Sample of a batch as it was recorded, with the batch's place in the order of recording."""
+
+    sample: Sample
+    seq: int
+    batch_id: str
+
+
+def samples_until(
+    connection: Connection, batch_id: str, subject: Subject, limit: int
+) -> list[RecordedSample]:
+    """Samples that batches had when recorded, up to the time of one of them; the latest of these.
+
+    At most `limit` batches of its spacecraft and run are read; empty if it is not in the database.
+    """
+    first = results.alias()
+    _, tracker = quantity_and_tracker(subject)
+    values = tracker_values if tracker else first
+    columns = [values.c[name] for name in (*tables.COUNTED, "status", *tables.MEASURED)]
+    last = results.alias()
+    query = (
+        select(*PLACE, first.c.seq, *columns)
+        .select_from(results)
+        .join(last, last.c.id == batch_id)
+        .join(first, first.c.id == results.c.batch_id)
+        .where(
+            results.c.current,
+            results.c.spacecraft == last.c.spacecraft,
+            results.c.run == last.c.run,
+            results.c.time_ns <= last.c.time_ns,
+        )
+    )
+    if tracker:
+        same_batch = tracker_values.c.batch_id == results.c.batch_id
+        query = query.join(tracker_values, same_batch).where(tracker_values.c.tracker == tracker)
+    sample_of = sampler(subject)
+    rows = map(dict, connection.execute(newest_first(query).limit(limit)).mappings())
+    samples = [(sample_of(row, {tracker: row}), row["seq"], row["batch_id"]) for row in rows]
+    return [RecordedSample(*each) for each in samples if each[0] is not None]
 
 
 def latest_samples(

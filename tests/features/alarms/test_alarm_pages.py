@@ -1,5 +1,6 @@
 """The pages of alarms: usual cause, related alarms, the named clock, the count on every page."""
 
+import html
 import re
 from pathlib import Path
 
@@ -7,13 +8,17 @@ import httpx
 import pytest
 
 from service.app.factory import open_app
+from service.features.alarms.part import Alarms
+from service.trends.limits import LimitSettings
 from service.trends.quantities import QUANTITIES, limited_names
 from service.web.app import create_app
 from service.web.console.formatting import with_day_of_year
 from tests.fresh_databases import sqlite_at
+from tests.storage import twin
 from tests.web import fleet
 from tests.web.serving import Server, in_process_settings
 
+MEAN_OF_3 = {"minimum_count": 3, "duration_s": 0}
 SIZE = 12
 OPERATORS = Path(__file__).parents[3] / "docs" / "operators.md"
 
@@ -146,3 +151,121 @@ def test_an_alarm_that_went_out_again_shows_the_last_time_and_how_often(tmp_path
         overview = client.get("/").text
         assert "<title>Overview" in overview
         assert "1 alarms returned" in text_of(client.get("/alarms"))
+
+
+def limit(**bounds):
+    return LimitSettings.model_validate(bounds | MEAN_OF_3)
+
+
+def links(page, which, text="worst batch of these"):
+    """Ids of the batches that a row of the page links with a text."""
+    row = re.search(rf'<tr><th scope="row">{which}</th>.*?</tr>', page)[0]
+    return re.findall(rf'href="/batches/(\w+)[^"]*">{text}</a>', row)
+
+
+@pytest.mark.parametrize(
+    ("quantity", "settings", "fault"),
+    [
+        ("residual_ratio", limit(warning={"high": 0.5}), {"noise_arcsec": (1.0, 9.0)}),
+        ("magnitude_offset_mag", limit(warning={"low": -0.01}), {"offset_mag": -0.2}),
+        ("unmatched_share", limit(warning={"high": 0.01}), {"noise_arcsec": (0.0, 200.0)}),
+    ],
+)
+@pytest.mark.parametrize("tracker", [None, twin.SECOND])
+def test_a_mean_says_of_how_many_and_links_the_batch_that_caused_it(
+    opened, sky, missions, quantity, settings, fault, tracker
+):
+    """The one bad batch is older than the batch with which the mean left its limits."""
+    mission = twin.twin(missions)
+    app = opened(mission)
+    limits = app.part(Alarms).limits
+    limits.set("XTE", quantity, settings, who="jb")
+    ids = {}
+
+    def send(k, **wanted):
+        answer = app.submissions.submit(
+            twin.submission(sky, mission, f"b{k}", after_s=30.0 * k, **wanted)
+        )
+        ids[k] = answer.id
+
+    send(0)
+    send(2, **fault)
+    send(4)
+    with Server(create_app(app)) as address, httpx.Client(base_url=address) as client:
+
+        def page():
+            found = client.get("/api/v1/alarms").json()["items"]
+            (id,) = (
+                each["id"]
+                for each in found
+                if (each["quantity"], each["tracker"]) == (quantity, tracker)
+            )
+            return client.get(f"/alarms/{id}").text
+
+        (raised,) = links(page(), "raised", "batch")
+        assert raised == ids[4]
+        # A late batch takes the place of the oldest.
+        send(3)
+        now = page()
+        for which in ("raised", "worst", "latest"):
+            assert links(now, which) == [ids[2]]
+        assert now.count("mean of 3 batches") == 3
+        assert f'href="/batches/{ids[2]}">worst batch</a>' in now
+        # The comparison with the day before names causes.
+        link = html.unescape(re.search(r'href="([^"]*)">Compare with the day before</a>', now)[1])
+        assert link.endswith("#why-title")
+        assert 'aria-current="true">the day before</a>' in client.get(link).text
+        # The mean that it was is not known any more: what there is stays linked.
+        changed = settings.model_copy(update={"minimum_count": 4})
+        limits.set("XTE", quantity, changed, who="jb")
+        now = page()
+        assert "mean of" not in now
+        assert [links(now, which) for which in ("raised", "worst", "latest")] == [[], [], []]
+        assert links(now, "raised", "batch") == [raised]
+
+
+def test_the_list_shows_the_bound_of_the_severity_of_now(tmp_path):
+    app = open_app(in_process_settings(sqlite_at(tmp_path / "acquire.db")))
+    for name, now in (("XTE", "critical"), ("SWAS", "warning"), ("SOHO", "watch")):
+        columns = {"severity": "critical", "current_severity": now, "bound": 0.5}
+        fleet.put_alarm(app, name, [("raised", 0)], **columns)
+    with Server(create_app(app)) as address, httpx.Client(base_url=address) as client:
+        listed = client.get("/alarms").text
+        bounds = re.findall(
+            r'data-name="spacecraft"><a href="/spacecraft/([\w-]+)".*?data-name="bound">(\d+)',
+            listed,
+            re.DOTALL,
+        )
+        assert dict(bounds) == {"XTE": "50", "SWAS": "25", "SOHO": "15"}
+        found = client.get("/api/v1/alarms").json()["items"]
+        (eased,) = (each["id"] for each in found if each["spacecraft"] == "SOHO")
+        text = text_of(client.get(f"/alarms/{eased}")).replace("\u202f", " ")
+        assert (
+            "worst severity so far, is 50.0 %; that of watch, the severity now, is 15.0 %" in text
+        )
+
+
+def test_another_alarm_is_related_for_a_stated_reason_alone(tmp_path):
+    app = open_app(in_process_settings(sqlite_at(tmp_path / "acquire.db")))
+    second = {"tracker": "STARTRACKER_2"}
+    fleet.put_alarm(app, "XTE", [("raised", 0)], **second)
+    fleet.put_alarm(app, "XTE", [("raised", 0.25)], quantity="suspect_share")
+    fleet.put_alarm(app, "XTE", [("raised", 9)], quantity="ambiguous_share", **second)
+    fleet.put_alarm(app, "XTE", [("raised", 9)], quantity="silence_s")
+    fleet.put_alarm(app, "SWAS", [("raised", 0)])
+    fleet.put_alarm(app, "SOHO", [("raised", 0.25)])
+    with Server(create_app(app)) as address, httpx.Client(base_url=address) as client:
+        found = client.get("/api/v1/alarms", params={"spacecraft": "XTE"}).json()["items"]
+        (id,) = (each["id"] for each in found if each["quantity"] == "unmatched_share")
+        page = client.get(f"/alarms/{id}").text
+        related = page[page.index('id="related"') : page.index('id="times-out"')]
+        rows = [text_of(httpx.Response(200, text=row)) for row in related.split("<li>")[1:]]
+        assert len(rows) == 3
+        reasons = (
+            "same spacecraft, raised 15 min apart",
+            "same tracker",
+            "same quantity, same time",
+        )
+        for reason in reasons:
+            assert any(reason in row.replace("\u202f", " ") for row in rows), rows
+        assert "SOHO" not in related

@@ -5,7 +5,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from service.features.alarms.windows import SampleWindow
+from service.features.alarms.windows import Point, SampleWindow, largest_contribution
+from service.storage.queries.trends import RecordedSample
 from service.trends.limits import LimitSettings, Severity
 from service.trends.quantities import default_limits, limited_names
 
@@ -100,6 +101,30 @@ def test_the_value_does_not_depend_on_the_order_in_which_batches_come(samples, c
     shuffled = list(samples)
     random.shuffle(shuffled)
     assert last(sorted(samples)) == last(shuffled)
+
+
+@given(
+    st.permutations(range(12)),
+    st.integers(2, 5),
+    st.integers(1, 12),
+    st.sampled_from([{"warning": {"high": 1}}, {"warning": {"low": 1e9}}]),
+)
+def test_a_mean_leads_to_its_batch_whatever_arrives_later(times, count, evaluated, bounds):
+    settings = limits(watch={}, critical={}, minimum_count=count, **bounds)
+    # Powers of two have distinct sums: no two means are equal.
+    samples = [(time, float(2**k), 1) for k, time in enumerate(times)]
+    window = SampleWindow()
+    judged = [window.add(each, settings) for each in samples[:evaluated]][-1]
+    if judged is None:
+        return
+    latest, wanted = window.samples[-1], max if "high" in bounds["warning"] else min
+    recorded = [RecordedSample(each, seq, str(each[0])) for seq, each in enumerate(samples)]
+    recorded = [each for each in recorded if each.sample[0] <= latest[0]]
+    point = Point(judged.value, "", str(latest[0]))
+    cause = wanted(window.samples, key=lambda each: each[1])
+    assert largest_contribution(point, recorded, settings) == str(cause[0])
+    missing = [each for each in recorded if each.batch_id != str(cause[0])]
+    assert largest_contribution(point, missing, settings) is None
 
 
 @given(
