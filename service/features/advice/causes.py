@@ -63,7 +63,8 @@ class StarTable:
     `outcome` (n,) is u, a or m: unique, ambiguous, unmatched.  `offset_sigmas` is the distance
     to the nearest catalog star, NaN without an attitude and inf beyond `NEAR_DEG`;
     `offset_mag` is observed minus catalog.  `density` (b, t) counts the catalog stars near
-    each boresight.  `room_deg` (b,) is the a priori error that the zone leaves room for.
+    each boresight.  `solved` (b,) is True for a good attitude; `a_priori_deg` (b,) is NaN without
+    one, and `room_deg` (b,) is the a priori error that the zone leaves room for.
     """
 
     total: int
@@ -92,11 +93,6 @@ class StarTable:
     def ambiguous(self) -> Flags:
         """Mask (n,) of the ambiguous stars."""
         return np.asarray(self.outcome == "a")
-
-    def share(self, of: Flags | None = None) -> float:
-        """Share of ambiguous stars, among all or the selected ones; NaN if none is selected."""
-        chosen = self.ambiguous if of is None else self.ambiguous[of]
-        return float(chosen.mean()) if len(chosen) else float("nan")
 
     def reported(self, tracker: int) -> Vector:
         """Number of stars (b,) that a tracker reported in each batch."""
@@ -129,7 +125,7 @@ def star_table(sample: PeriodSample, sky: SkyModel) -> StarTable:
         seen_by = correct(batch, mission) if answer.observations else ()
         presumed = presumed_attitude(batch, answer, mission)
         attitude = None if presumed is None else presumed.attitude
-        if answer.attitude is not None:
+        if answer.attitude is not None and solved[-1]:
             attitude = matrix_from_quaternion(answer.attitude.quaternion)
         offsets_of = _offsets_of(answer, seen_by, catalog, batch)
         for seen, found, offsets in zip(seen_by, answer.observations, offsets_of, strict=True):
@@ -154,7 +150,11 @@ def star_table(sample: PeriodSample, sky: SkyModel) -> StarTable:
                 for each in found.stars
                 if each.outcome == "ambiguous" and each.rivals
             ]
-    angles = [row["a_priori_angle_deg"] for row in sample.rows]
+    # A wrong identification gives an angle of any size, and no good attitude.
+    angles = [
+        row["a_priori_angle_deg"] if is_good else None
+        for row, is_good in zip(sample.rows, solved, strict=True)
+    ]
     kinds = (np.int64, np.int64, "U1", *[np.float64] * 4)
     # The empty first part gives each column its type if the sample has no star; numpy's own
     # annotations cannot express a sequence of kinds.
@@ -258,14 +258,7 @@ def causes(now: StarTable, before: StarTable | None) -> list[Cause]:
 
 
 def _cause(factor: Factor, now: StarTable, hit: Flags, explained: Flags) -> Cause:
-    rest = ~factor.stars
     count, lost = int(np.count_nonzero(hit)), int(np.count_nonzero(now.outcome != "u"))
-    effect = f"{count} of {lost} ambiguous or unmatched stars"
-    if np.count_nonzero(rest) >= LEAST_STARS:
-        effect += (
-            f"; of the other stars {100 * now.share(rest):.1f} % are ambiguous, of all "
-            f"{100 * now.share():.1f} %"
-        )
     last = int(np.flatnonzero(explained)[-1])
     after = now.batches - 1 - last
     is_over = after >= max(OVER_BATCHES, OVER_SHARE * now.batches)
@@ -274,7 +267,7 @@ def _cause(factor: Factor, now: StarTable, hit: Flags, explained: Flags) -> Caus
         text=factor.text,
         evidence=factor.evidence,
         remedy=factor.remedy,
-        effect=f"{effect}.",
+        effect=f"{count} of {lost} ambiguous or unmatched stars.",
         over_since=utc_of_unix(float(unix_seconds(now.time_ns[last]))).text if is_over else None,
     )
 
@@ -306,8 +299,14 @@ def _a_priori(now: StarTable, before: StarTable | None) -> Iterator[Factor]:
         elif beyond.mean() <= NOISY * np.mean(before.a_priori_deg > before.room_deg) + USUAL_SHARE:
             # No statement: wrong attitudes are far from correct a priori ones, too.
             return
-    stars = beyond[now.batch]
-    yield Factor(beyond, stars, text, f"{evidence}.", remedy)
+    evidence += "."
+    if not now.solved.all() and np.count_nonzero(beyond) > np.count_nonzero(now.solved) / 2:
+        beyond |= ~now.solved
+        evidence += (
+            " Batches without a good attitude have no such angle; they count here, since most of "
+            "the others are beyond the zone."
+        )
+    yield Factor(beyond, beyond[now.batch], text, evidence, remedy)
 
 
 def _wider_zone(now: StarTable, before: StarTable | None) -> Iterator[Factor]:

@@ -1,9 +1,11 @@
 """Causes of ambiguous and unmatched stars, told from a day and the day before."""
 
 import json
+import re
 
 import pytest
 
+from service.features.advice.causes import LEAST_BATCHES
 from service.features.advice.part import AdviceService
 from service.observations.schema import submission_from_json
 from service.simulate.stretches import NO_TROUBLES, Pass
@@ -11,6 +13,7 @@ from service.simulate.telemetry import draw_pass
 from service.times import DAY_S, parse_utc, shifted
 
 BATCHES = 24
+ZONE_DEG = 10.66
 BEGIN = "1999-03-02T00:00:00.000Z"
 
 
@@ -78,8 +81,22 @@ def test_the_cause_of_a_bad_day_is_named_with_what_it_explains(compare, changed,
     assert cause in told
     assert 0 < told[cause].batches <= BATCHES
     assert told[cause].remedy
+    assert re.fullmatch(r"\d+ of \d+ ambiguous or unmatched stars\.", told[cause].effect)
     explained = [each.batches for each in found.causes]
     assert explained == sorted(explained, reverse=True)
+
+
+def test_angles_of_wrong_identifications_blame_neither_zone_nor_a_priori_attitude(app, compare):
+    def loose(body):
+        body["options"]["tolerances"] = {"separation_deg": 0.05}
+
+    found = compare(change=loose, identifier="starid", stars=3)
+    page = app.results.page(spacecraft="XTE", start=parse_utc(BEGIN), limit=BATCHES)
+    wrong = [each for each in page.items if (each.measures["a_priori_angle_deg"] or 0) > ZONE_DEG]
+    assert len(wrong) >= LEAST_BATCHES
+    assert {each.status for each in wrong} == {"suspect"}
+    assert found.causes
+    assert not [each for each in found.causes if "a priori" in each.text]
 
 
 def test_a_day_like_the_one_before_has_no_cause_and_no_certain_change(compare):
