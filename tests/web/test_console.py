@@ -1,10 +1,12 @@
 """The console as markup: what its pages say, and what they do not let through."""
 
 import base64
+import html
 import itertools
 import math
 import re
 import tomllib
+from dataclasses import replace
 
 import httpx
 import numpy as np
@@ -16,6 +18,7 @@ from service.observations.schema import submission_from_json
 from service.simulate.stretches import NO_TROUBLES, Pass
 from service.simulate.telemetry import draw_pass
 from service.storage.queries.star_field import Boresight, TrackerField
+from service.times import HOUR_S
 from service.vectors import angle_between_deg, matrix_from_quaternion
 from service.web.app import create_app
 from service.web.console import formatting, options
@@ -570,5 +573,26 @@ def test_files_of_attitudes_say_what_each_grade_is_and_how_many_stretches(tmp_pa
         # The gap follows the cadence, so that an AEM of a steady cadence is one segment.
         aem = client.get("/api/v1/spacecraft/XTE/attitude", params={"format": "aem"}).text
         assert aem.count("META_START") == 1
-        page = client.get("/spacecraft/XTE/files", params={"gap_s": "60"}).text
-        assert "a reader can interpolate hardly anything" in page
+        page = text_of(client.get("/spacecraft/XTE/files", params={"gap_s": "60"}))
+        assert "16 stretches for 16 attitudes" in page
+        assert "15 times after a gap longer than 1 min (choose a larger one below" in page
+
+
+def test_files_of_a_day_say_which_stretches_no_larger_gap_would_join(tmp_path):
+    app = open_app(in_process_settings(f"sqlite:///{tmp_path / 'acquire.db'}"))
+    asked = replace(STEADY, start="1999-03-01T12:10:00.000Z", batches=24, cadence_s=HOUR_S)
+    with Server(create_app(app)) as address, httpx.Client(base_url=address, timeout=60) as client:
+        for each in draw_pass(app.missions["XTE"], app.sky, asked):
+            client.post("/api/v1/batches", json=each.batch).raise_for_status()
+        files, day = "/spacecraft/XTE/files", {"day": "1999-03-01", "gap_s": "7200"}
+        page = client.get(files, params=day)
+        assert re.search(r"raw 12 \d+ 2\Dh", text_of(page)), text_of(page)
+        told = re.search(r"begins (\d+) times after a turn of more than 90°", text_of(page))
+        assert told, text_of(page)
+        assert "choose a larger one" not in text_of(page)
+        link = html.unescape(re.search(r'href="([^"]*format=aem[^"]*)"', page.text)[1])
+        aem = client.get(link).raise_for_status().text
+        assert aem.count("META_START") == 1 + int(told[1])
+        assert {each[:10] for each in re.findall(r"^1999\S+", aem, re.MULTILINE)} == {"1999-03-01"}
+        assert client.get(files, params={"day": "yesterday"}).status_code == 422
+        assert client.get(files, params={"day": "9999-12-31"}).status_code in (200, 422)

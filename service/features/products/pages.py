@@ -5,14 +5,17 @@ from itertools import islice
 from typing import Annotated
 from urllib.parse import quote, urlencode
 
+import numpy as np
 from pydantic import Field, field_validator
 from starlette.responses import Response
 
 from service.features.products.attitude_formats import attitude_formats
-from service.features.products.attitudes import AttitudeSeries, ProductGrade
+from service.features.products.attitudes import AttitudeSeries, ProductGrade, turns_far
 from service.features.products.part import TABLE_KINDS, Products
 from service.missions.product_settings import MAX_LARGEST_GAP_S
 from service.table_files.formats import TABLE_FORMATS
+from service.times import DAY_S, bucket_start
+from service.web.console.formatting import completed_utc
 from service.web.console.page import ContextDep, FromQuery, PageContext, console_page
 from service.web.console.pages.period import without_gyro
 from service.web.console.pages.spacecraft_page import (
@@ -22,6 +25,7 @@ from service.web.console.pages.spacecraft_page import (
     shown_period,
 )
 from service.web.requests.access import Policy
+from service.web.requests.query_parameters import Start
 
 GRADES: dict[ProductGrade, str] = {
     "smoothed": "The definitive attitude: every measurement of the day, before and after each "
@@ -37,21 +41,32 @@ FEW_PER_STRETCH = 10
 
 
 class FilesQuery(SpacecraftQuery):
-    """Query of the files page: period and largest gap; empty: from the mission or the cadence."""
+    """Query of the files page: period and largest gap; empty: from the mission or the cadence.
+
+    A `day` in UTC is the period in place of the other parameters.
+    """
 
     gap_s: Annotated[float | None, Field(gt=0, le=MAX_LARGEST_GAP_S)] = None
+    day: Start = None
 
     @field_validator("gap_s", mode="before")
     @classmethod
     def _without_empty_gap(cls, value: object) -> object:
         return None if value == "" else value
 
+    @field_validator("day", mode="before")
+    @classmethod
+    def _completed_day(cls, value: object) -> object:
+        return completed_utc(value) if isinstance(value, str) and value else None
+
 
 @dataclass(frozen=True)
 class GradeOfFile:
     """Summary of one grade of attitudes in a period: number, intervals, largest gap.
 
-    `missing` is the reason for having none, if known.
+    `missing` is the reason for having none, if known.  Intervals begin `after_turns` of more than
+    a quarter turn, `after_missing` attitudes of batches between, and `after_gaps` that are too
+    long; each counts for the first of these reasons.
 
     `is_cut` is true if only the first `MOST_COUNTED` attitudes were counted.
     """
@@ -60,9 +75,16 @@ class GradeOfFile:
     what: str
     missing: str
     attitudes: int
-    stretches: int
+    after_turns: int
+    after_missing: int
+    after_gaps: int
     largest_gap_s: float
     is_cut: bool
+
+    @property
+    def stretches(self) -> int:
+        """Number of intervals."""
+        return min(self.attitudes, 1) + self.after_turns + self.after_missing + self.after_gaps
 
     @property
     def is_shattered(self) -> bool:
@@ -74,6 +96,10 @@ class GradeOfFile:
 def files_page(name: str, query: FromQuery[FilesQuery], context: ContextDep) -> Response:
     """Console page with export files of a period: attitudes by grade and format, and tables."""
     context.app.context.mission(name)
+    if query.day:
+        number = query.day.bucket(DAY_S)
+        start, end = (bucket_start(each, DAY_S) for each in (number, number + 1))
+        query = query.model_copy(update={"range": None, "start": start, "end": end})
     shown = shown_period(context, name, query)
 
     def address(product: str, format: str, **more: str) -> str:
@@ -119,21 +145,32 @@ def _grades(
             grade=grade,
             largest_gap_s=query.gap_s,
         )
-        found.append(_counted(grade, what, "" if grade == "raw" else missing, series))
+        found.append(_counted(grade, what, missing, series))
     return found
 
 
-def _counted(grade: ProductGrade, what: str, missing: str, series: AttitudeSeries) -> GradeOfFile:
-    attitudes = stretches = 0
+def _counted(grade: ProductGrade, what: str, why_none: str, series: AttitudeSeries) -> GradeOfFile:
+    attitudes = after_turns = after_missing = after_gaps = 0
     last = None
     for block in islice(series.blocks, MOST_COUNTED):
         attitudes += len(block)
-        begun = len(set(block.stretch.tolist()))
-        stretches += begun - (last == int(block.stretch[0]))
-        last = int(block.stretch[-1])
+        rows = block if last is None else last.followed_by(block)
+        begins = np.diff(rows.stretch) != 0
+        turns, missing = turns_far(rows), np.diff(rows.gaps) != 0
+        after_turns += int(np.count_nonzero(begins & turns))
+        after_missing += int(np.count_nonzero(begins & ~turns & missing))
+        after_gaps += int(np.count_nonzero(begins & ~turns & ~missing))
+        last = rows.taken(slice(-1, None))
         if attitudes >= MOST_COUNTED:
             break
-    is_cut = attitudes >= MOST_COUNTED
     return GradeOfFile(
-        grade, what, missing, attitudes, stretches, series.about.largest_gap_s, is_cut
+        grade,
+        what,
+        "" if grade == "raw" else why_none,
+        attitudes,
+        after_turns,
+        after_missing,
+        after_gaps,
+        series.about.largest_gap_s,
+        is_cut=attitudes >= MOST_COUNTED,
     )
