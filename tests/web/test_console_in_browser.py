@@ -261,6 +261,7 @@ def test_a_point_of_a_trend_leads_to_its_batches_and_lines_can_be_hidden(
     assert "Without SOHO" in text(browser, "#more")
     browser.wait(lambda: "SOHO" in text(browser, "[data-chart=stars] + .chart-keys"))
     key = "document.querySelector('[data-chart=stars] + .chart-keys button')"
+    assert "XTE: " in browser.run(f"{key}.innerText")
     browser.run(f"{key}.click()")
     assert browser.run(f"{key}.ariaPressed") == "false"
     browser.wait(lambda: browser.run(f"document.activeElement === {key}"))

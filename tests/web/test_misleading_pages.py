@@ -132,6 +132,23 @@ def test_a_time_in_any_common_form_finds_the_batch(small_fleet, typed):
     assert "A batch at 1999-03-01 (060) 12:00:00 UTC" in page
 
 
+def test_a_time_finds_the_nearest_batch_of_every_spacecraft_if_none_is_chosen(small_fleet):
+    _, client = small_fleet
+    page = client.get("/batches", params={"find": "1999-03-01 12:00"})
+    assert "8 batches at 1999-03-01 (060) 12:00:00 UTC" in text_of(page)
+    rows = re.findall(
+        r'<th scope="row"><time datetime="([^"]*)".*?/spacecraft/([^?"]*)', page.text, re.S
+    )
+    assert sorted(rows, key=lambda each: each[1]) == [
+        ("1999-03-01T12:00:00.000Z", name) for name in fleet.names(8)
+    ]
+    page = client.get("/batches", params={"find": "1999-03-01 12:10"})
+    assert "the nearest is 10 min earlier" in text_of(page)
+    assert {name for name in fleet.names(8) if f"/spacecraft/{name}" in page.text} == {
+        *fleet.names(8)
+    }
+
+
 def test_a_time_without_a_batch_finds_the_nearest_and_says_how_far_it_is(small_fleet):
     _, client = small_fleet
     before_all = shifted(fleet.END, -2 * 86_400.0).text
@@ -153,7 +170,9 @@ def test_each_time_that_the_overview_writes_finds_its_batch(small_fleet):
     assert {len(each) for each in times} >= {len("1999-03-01 (060) 12:00"), len("03-01 12:00")}
     for typed in set(times):
         found = text_of(client.get("/batches", params={"find": typed}))
-        assert re.search(r"A batch at 1999|the nearest is .* (earlier|later)", found), typed
+        assert re.search(
+            r"(A batch|\d batches) at 1999|the nearest is .* (earlier|later)", found
+        ), typed
 
 
 @pytest.mark.parametrize("typed", ["2026-330-0179", "060", "12-1", "a 12:00", "1999-02-30 12:00"])

@@ -268,6 +268,8 @@ def _pointing(shown: Answer) -> list[dict[str, Any]]:
 
 
 ROWS = 50
+MOST_NEAREST = 20
+"""Greatest number of spacecraft whose batches nearest to a time are listed."""
 Any_ = Literal[""]
 """Type of an empty form field, which selects any value."""
 
@@ -326,14 +328,21 @@ def batches_page(query: FromQuery[BatchesQuery], context: ContextDep) -> Respons
 
 
 def _nearest(context: PageContext, query: BatchesQuery, moment: Utc) -> list[tuple[Summary, float]]:
-    """Batches before and after a time, the nearer first, and their offsets in seconds."""
-    found = context.app.results.around(moment, query.run, query.spacecraft or None)
-    offsets = [
-        (each, (recorded_utc(each.time).tai_ns - moment.tai_ns) * 1e-9)
-        for each in (found.earlier, found.later)
-        if each is not None
-    ]
-    return sorted(offsets, key=lambda each: abs(each[1]))
+    """Batches about a time, the nearer first, and their offsets in seconds.
+
+    They are the batches before and after it of the chosen spacecraft, or the nearest one of each.
+    """
+    offsets = []
+    for name in [query.spacecraft] if query.spacecraft else context.spacecraft:
+        around = context.app.results.around(moment, query.run, name)
+        sides = [
+            (each, (recorded_utc(each.time).tai_ns - moment.tai_ns) * 1e-9)
+            for each in (around.earlier, around.later)
+            if each is not None
+        ]
+        sides.sort(key=lambda each: abs(each[1]))
+        offsets += sides if query.spacecraft else sides[:1]
+    return sorted(offsets, key=lambda each: abs(each[1]))[:MOST_NEAREST]
 
 
 def named(context: PageContext, query: BatchesQuery, text: str) -> list[Summary]:

@@ -383,11 +383,12 @@ export class Trend {
     this.holder.setAttribute("aria-label", `${this.definition.title}. ${values.join("; ")}${marked}${beyond ? `; ${beyond} beyond the edge` : ""}`);
   }
 
-  // A button for each line of several, which hides it and shows it; names of other spacecraft.
+  // A button for each line of several, which hides it and shows it; names of several spacecraft.
   drawKeys() {
     const keys = this.holder.nextElementSibling?.matches(".chart-keys") ? this.holder.nextElementSibling : document.createElement("p");
     keys.className = "chart-keys range";
-    const buttons = this.known.length > 1 ? this.known.map(({ name, label, dash }) => this.key(name, `${dash ? "╌" : "━"} ${label}`)) : [];
+    const own = this.others.length ? `${this.history.spacecraft}: ` : "";
+    const buttons = own || this.known.length > 1 ? this.known.map(({ name, label, dash }) => this.key(name, `${dash ? "╌" : "━"} ${own}${label}`)) : [];
     const names = this.others.map(({ spacecraft, shift }, k) => {
       const mark = element("span", { className: shift ? "soft" : TONES[k % TONES.length].slice(2), ariaHidden: "true" }, "━ ");
       return element("span", {}, mark, `${spacecraft}: ${this.known[0].label}${shift ? `, ${shift / DAY_S} d before` : ""}`);
