@@ -19,7 +19,7 @@ def text_of(part):
 
 @pytest.fixture(scope="module")
 def pages(tmp_path_factory):
-    """Row of each spacecraft in the overview, and the page to which its change leads."""
+    """Row of each spacecraft in the overview, the page to which its change leads, its advice."""
     end = bucket_start(utc_now().bucket(HOUR_S), HOUR_S)
     with (
         two_days(tmp_path_factory.mktemp("days"), end, BATCHES) as address,
@@ -31,13 +31,16 @@ def pages(tmp_path_factory):
                 rf"<tr[^>]*>(?:(?!</tr>).)*/{case.name}\?(?:(?!</tr>).)*</tr>", overview, re.DOTALL
             )
             link = html.unescape(re.search(r'href="([^"]*before=day[^"]*)"', row)[1])
-            found[case.name] = row, client.get(link).raise_for_status().text
+            page = client.get(link).raise_for_status().text
+            best = re.search(r'href="(/advice/[^"]*)#best"', page)[1]
+            advice = client.get(html.unescape(best)).raise_for_status().text
+            found[case.name] = row, page, advice
         yield found
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_the_change_leads_to_its_cause_and_to_the_same_figures(pages, case):
-    row, page = pages[case.name]
+    row, page, _ = pages[case.name]
     title = re.search(r'before=day[^>]*title="([^"]*)"', row)[1]
     panel = text_of(re.search(r'<div id="why".*?</section>', page, re.DOTALL)[0])
     told = re.search(
@@ -57,3 +60,16 @@ def test_the_change_leads_to_its_cause_and_to_the_same_figures(pages, case):
         assert "As many ambiguous stars as before, within chance" in panel
         assert "≈" in row
         assert causes == []
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_the_one_setting_stands_behind_the_remedy_of_the_cause(pages, case):
+    advice = pages[case.name][2]
+    best = text_of(re.search(r'<section class="advice" id="best">.*?</section>', advice, re.S)[0])
+    if " ambiguous instead of " not in best:
+        assert "No single setting of the identifier" in best
+    elif case.cause:
+        assert f"First the cause in the last day: {case.cause} →" in best
+        assert best.index("→") < best.index(" ambiguous instead of ")
+    else:
+        assert "First the cause" not in best
