@@ -14,7 +14,12 @@ from service.storage.recording.events import HeardEvents
 from service.storage.recording.writer import Writer, remove_probe
 from service.storage.sql import engines
 from service.storage.sql.database_file import FileLock
-from service.storage.sql.migrations import bring_up_to_date, disposed, require_up_to_date
+from service.storage.sql.migrations import (
+    bring_up_to_date,
+    disposed,
+    require_known_file,
+    require_up_to_date,
+)
 from service.storage.sql.projector_lock import ProjectorLock
 
 
@@ -49,6 +54,7 @@ class Store(Readers):
         file = engines.database_file(url)
         if file is not None and not create:
             file.require_there()
+        require_known_file(url)
         timeouts = engines.TO_COMMIT if serving else None
         self.file_lock = None if file is None else FileLock(file)
         """Lock of the SQLite file against other writing processes; None on a server."""

@@ -1,8 +1,7 @@
-"""Makes the databases of a schema that `tests/records/test_earlier_databases.py` upgrades.
+"""Makes the databases of a schema that `tests/storage/test_earlier_databases.py` upgrades.
 
-    python -m tests.databases.make                                   of this tree
-    python -m tests.databases.make --tree PATH                       of another checkout
-    python -m tests.databases.make --copied-down 0005 --source 0006  of a schema without code
+    python -m tests.databases.make               of this tree
+    python -m tests.databases.make --tree PATH   of another checkout
 
 Writes REVISION.sqlite.gz and REVISION.postgresql.sql.gz beside this file.  Run it
 after a migration was added, before the first commit that has the migration's code,
@@ -32,9 +31,7 @@ from pathlib import Path
 from typing import Any
 
 import httpx
-from alembic import command
-from alembic.config import Config
-from sqlalchemy import Connection, MetaData, create_engine, make_url, text
+from sqlalchemy import Connection, create_engine, make_url, text
 from sqlalchemy.pool import NullPool
 from tqdm import tqdm
 
@@ -243,70 +240,6 @@ def _await_ready(client: httpx.Client, process: subprocess.Popen[bytes]) -> None
     raise SystemExit("the server did not become ready")
 
 
-# ---- rows of a later schema ----------------------------------------------------------------------
-
-
-def copy_down(source: str, target: str, revision: str) -> None:
-    """Fill an earlier schema with what it can hold of a later database's rows."""
-    made = create_engine(target, poolclass=NullPool)
-    given = create_engine(source, poolclass=NullPool)
-    with made.begin() as connection:
-        _migrate(connection, revision)
-    tables, later = MetaData(), MetaData()
-    tables.reflect(made)
-    later.reflect(given)
-    has_frames = "frames" in tables.tables
-    with given.connect() as reading, made.begin() as writing:
-        framed = set(
-            reading.scalars(text("SELECT id FROM results WHERE spacecraft = :f"), {"f": FRAMED})
-        )
-        for table in tables.sorted_tables:
-            if table.name == "alembic_version":
-                continue
-            columns = later.tables[table.name].c
-            # Parents of results stand before their what-ifs.
-            rows = reading.execute(
-                later.tables[table.name].select().order_by(*columns.values()[:1])
-            ).mappings()
-            kept = [
-                {name: row[name] for name in row if name in table.c}
-                for row in rows
-                if has_frames
-                or not (row.get("spacecraft") == FRAMED or row.get("result_id") in framed)
-            ]
-            writing.execute(table.delete())
-            if kept:
-                writing.execute(table.insert(), kept)
-        if made.dialect.name == "postgresql":
-            _set_sequences(writing)
-    made.dispose()
-    given.dispose()
-
-
-def _migrate(connection: Connection, revision: str) -> None:
-    config = Config()
-    config.set_main_option("script_location", str(TREE / "migrations"))
-    config.attributes["connection"] = connection
-    command.upgrade(config, revision)
-
-
-def _set_sequences(connection: Connection) -> None:
-    """Rows that came with their numbers do not move the counters of PostgreSQL."""
-    owned = connection.execute(
-        text(
-            "SELECT table_name, column_name FROM information_schema.columns WHERE "
-            "table_schema = 'public' AND column_default LIKE 'nextval(%'"
-        )
-    ).all()
-    for table, column in owned:
-        connection.execute(
-            text(
-                f"SELECT setval(pg_get_serial_sequence('{table}', '{column}'), "
-                f"COALESCE((SELECT MAX({column}) FROM {table}), 1))"
-            )
-        )
-
-
 # ---- files ---------------------------------------------------------------------------------------
 
 
@@ -364,6 +297,19 @@ def restore_postgresql(revision: str, connection: Connection, schema: str) -> No
         cursor.execute(dump.encode())
 
 
+def restore(revision: str, database: str) -> None:
+    """Put a fixture back into an empty database, of the kind that the URL names."""
+    url = make_url(database)
+    if url.drivername == "sqlite":
+        restore_sqlite(revision, Path(url.database or ""))
+        return
+    engine = create_engine(url, poolclass=NullPool)
+    with engine.begin() as connection:
+        schema = connection.scalar(text("SELECT current_schema()"))
+        restore_postgresql(revision, connection, schema)
+    engine.dispose()
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         prog="python -m tests.databases.make",
@@ -371,19 +317,12 @@ def main() -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--tree", type=Path, default=TREE, help="the checkout to run")
-    parser.add_argument("--copied-down", metavar="REVISION", help="of a schema without code")
-    parser.add_argument("--source", metavar="REVISION", help="the fixture to copy from")
-    parsed = parser.parse_args()
+    tree = parser.parse_args().tree.resolve()
     with tempfile.TemporaryDirectory() as folder, postgresql_database() as postgresql:
         file = Path(folder, "made.db")
         targets = (f"sqlite:///{file}", postgresql)
-        for target in tqdm(targets, desc=parsed.copied_down or "recording", unit="database"):
-            if parsed.copied_down is None:
-                run_and_record(parsed.tree.resolve(), target)
-                continue
-            given = f"sqlite:///{Path(folder, 'given.db')}"
-            restore_sqlite(parsed.source, Path(folder, "given.db"))
-            copy_down(given, target, parsed.copied_down)
+        for target in tqdm(targets, desc="recording", unit="database"):
+            run_and_record(tree, target)
         revision = keep_sqlite(file)
         keep_postgresql(postgresql, revision)
     for each in (sqlite_file(revision), postgresql_file(revision)):

@@ -162,7 +162,7 @@ def test_pruning_takes_the_trackers_part_with_it(twins, sky, mission):
 
 
 def unsplit(app):
-    """As if the batches were of a version that did not split them."""
+    """As if the batches were recorded before the second tracker was there."""
 
     def change(connection):
         for table in OF_TRACKERS:

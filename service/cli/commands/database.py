@@ -166,7 +166,7 @@ def restore(parsed: Namespace) -> int:
     acquire database restore night.db --database sqlite:///acquire.db
     acquire database restore night.dump --database postgresql://user@host/attitudes
     """
-    from service.storage.sql.migrations import HEAD
+    from service.storage.sql.migrations import remedy
     from service.storage.upkeep.backup import restore as restore_backup
 
     with progress_bar("pages", "restoring") as bar:
@@ -175,8 +175,8 @@ def restore(parsed: Namespace) -> int:
             database, parsed.backup, lambda left, total: bar(total - left, total)
         )
     print(f"{parsed.backup}: restored; its schema is at {revision}")
-    if revision != HEAD:
-        print(f"this version needs {HEAD}: run `acquire database upgrade`")
+    if differs := remedy(database):
+        print(differs)
     return 0
 
 
@@ -285,9 +285,9 @@ def rebuild(parsed: Namespace) -> int:
 
 
 def split_trackers(parsed: Namespace) -> int:
-    """Split the batches of earlier versions by tracker, for trends of each tracker of a spacecraft
-    with several.  The service does the same by itself, more slowly.  You can stop the command at
-    any time; it continues when you start it again.
+    """Split batches by tracker that were recorded before their spacecraft had several trackers, for
+    the trends of each.  The service does the same by itself, more slowly.  You can stop the
+    command at any time; it continues when you start it again.
 
     acquire database split-trackers
     """

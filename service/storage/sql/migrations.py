@@ -28,8 +28,11 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-HEAD = max(each.name[:4] for each in shipped("migrations", "versions").glob("[0-9]*.py"))
-"""Newest schema revision in the folder `migrations/`."""
+REVISIONS = sorted(each.name[:4] for each in shipped("migrations", "versions").glob("[0-9]*.py"))
+"""Schema revisions in the folder `migrations/`, oldest first."""
+HEAD = REVISIONS[-1]
+LAST_OF_DEVELOPMENT = "2973fa51"
+"""Newest commit whose `acquire database upgrade` reads the schemas before the first revision."""
 UNFINISHED = "copy:"
 """Prefix of the revision of a database that `upkeep.copy` has not finished copying."""
 
@@ -38,9 +41,10 @@ def upgrade(database: str) -> None:
     """Upgrade a database to this version's schema, creating missing tables; data is kept.
 
     Raises `BadConfiguration` for a database that cannot be reached, is none, or was written by a
-    newer version.
+    newer version or by a development version before 0.2.0.
     """
     url = engines.database_url(database)
+    require_known_file(url)
     with writing_alone(engines.database_file(url)), disposed(engines.writing_engine(url)) as engine:
         bring_up_to_date(engine)
 
@@ -68,14 +72,43 @@ def connected(url: URL) -> Iterator[Connection]:
 
 
 def require_records(database: str) -> None:
-    """Raise `BadConfiguration` for a SQLite file that is missing or was never the service's.
+    """Raise `BadConfiguration` for a database with an unknown schema, or a SQLite file without one.
 
-    Opening the file to write would create the service's tables in it.
+    Opening a file without a schema to write would create the service's tables in it.
     """
     url = engines.database_url(database)
-    if url.drivername == "sqlite" and revision_of(database) is None:
+    with reading(database) as connection:
+        require_known(connection)
+        found = revision_in(connection)
+    if url.drivername == "sqlite" and found is None:
         raise BadConfiguration(
             f"ACQUIRE_DATABASE: {engines.shown_url(url)}: holds no records of this service"
+        )
+
+
+def require_known_file(url: URL) -> None:
+    """Raise `BadConfiguration` for a SQLite file with a schema that this version cannot upgrade.
+
+    To open the file for writing would change it, even if no record is written.  An unfinished copy
+    passes.
+    """
+    if url.drivername == "sqlite" and Path(url.database or "").is_file():
+        with connected(url) as connection:
+            require_known(connection, unfinished=True)
+
+
+def require_known(connection: Connection, *, unfinished: bool = False) -> None:
+    """Raise `BadConfiguration` for a schema that the migrations neither make nor change.
+
+    With `unfinished`, an unfinished copy passes.
+    """
+    found = revision_in(connection)
+    if found is None or found in REVISIONS:
+        return
+    if not (unfinished and found.startswith(UNFINISHED)):
+        raise BadConfiguration(
+            f"ACQUIRE_DATABASE: {engines.shown_url(connection.engine.url)}: "
+            f"{_difference(connection)}"
         )
 
 
@@ -88,9 +121,12 @@ def revision_of(database: str) -> str | None:
 def check(database: str) -> list[str]:
     """List the differences between a database's schema and the tables of the code.
 
-    Nothing is written and nothing created: raises `BadConfiguration` where there is no database.
+    Nothing is written and nothing created: raises `BadConfiguration` where there is no database, or
+    one of a development version before 0.2.0.
     """
     with reading(database) as connection:
+        if _is_of_development(revision_in(connection)):
+            require_known(connection)
         differs = _difference(connection)
         if differs is not None:
             return [differs]
@@ -164,22 +200,16 @@ def bring_up_to_date(engine: Engine, before: Callable[[], object] = lambda: None
                 before()
                 metadata.create_all(connection, tables=missing)
             return
+        require_known(connection)
         before()
         from alembic import command
-        from alembic.util import CommandError
 
         config = _config()
         config.attributes["connection"] = connection
-        try:
-            command.upgrade(config, "head")
-            what = "made with" if found is None else f"brought from {found} to"
-            metadata.create_all(connection, tables=_missing(connection))
-            log.info("%s: %s the schema %s", engines.shown_url(engine.url), what, HEAD)
-        except CommandError:
-            differs = _difference(connection)
-            raise BadConfiguration(
-                f"ACQUIRE_DATABASE: {engines.shown_url(engine.url)}: {differs}"
-            ) from None
+        command.upgrade(config, "head")
+        what = "made with" if found is None else f"brought from {found} to"
+        metadata.create_all(connection, tables=_missing(connection))
+        log.info("%s: %s the schema %s", engines.shown_url(engine.url), what, HEAD)
 
 
 def require_up_to_date(engine: Engine) -> None:
@@ -226,6 +256,17 @@ def revision_in(connection: Connection) -> str | None:
     return next(iter(revisions), None)
 
 
+def remedy(database: str) -> str | None:
+    """How a database's schema differs from this version's, and what to do; None if it does not."""
+    with reading(database) as connection:
+        return _difference(connection)
+
+
+def _is_of_development(revision: str | None) -> bool:
+    """True for the schema of a development version before 0.2.0."""
+    return revision is not None and revision < REVISIONS[0]
+
+
 def _difference(connection: Connection) -> str | None:
     """Difference of the database's schema from this version's, with the remedy; None if equal."""
     found = revision_in(connection)
@@ -240,6 +281,12 @@ def _difference(connection: Connection) -> str | None:
         return (
             "is an unfinished copy: run the same `acquire database copy` again, which goes on, or "
             "name another database"
+        )
+    if _is_of_development(found):
+        return (
+            f"was written by a development version before 0.2.0, with the schema {found}: "
+            f"upgrade it with `git checkout {LAST_OF_DEVELOPMENT} && make install && "
+            f".venv/bin/acquire database upgrade`, then this version, {__version__}, reads it"
         )
     if found < HEAD:
         return (

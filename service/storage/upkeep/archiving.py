@@ -137,8 +137,8 @@ def _days(connection: Connection, before: Utc) -> list[_Day]:
     for spacecraft, run in sorted({(day.spacecraft, day.run) for day in found}):
         if is_waiting(connection, spacecraft, run):
             raise BadConfiguration(
-                f"{spacecraft}, run {run}: batches of an earlier version are not split by tracker "
-                "yet: run `acquire database split-trackers` first"
+                f"{spacecraft}, run {run}: batches from before it had several trackers are not "
+                "split by tracker yet: run `acquire database split-trackers` first"
             )
     return found
 

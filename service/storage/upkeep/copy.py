@@ -77,12 +77,14 @@ def _target(database: str) -> Iterator[sa.Connection]:
     """Context manager of a connection to the target of a copy for writing, with its tables made."""
     with _named("TO"):
         url = engines.database_url(database)
+        migrations.require_known_file(url)
     with (
         _named("TO"),
         writing_alone(engines.database_file(url)),
         migrations.disposed(engines.writing_engine(url)) as engine,
     ):
         with migrations.reported(url), engine.begin() as connection:
+            migrations.require_known(connection, unfinished=True)
             is_new = migrations.revision_in(connection) is None
         if is_new:
             migrations.bring_up_to_date(engine)

@@ -1,6 +1,7 @@
-"""Splitting of older batches by tracker, which recording does by itself since schema 0008.
+"""Splitting by tracker of batches that were recorded before their spacecraft had several trackers.
 
-The module also has the thread that does this and other remaining work of an upgrade.
+The module also has the thread that does this, after it has given results of earlier versions their
+digests.
 
 Batches are split in small steps: read and computed beside the writer, then written in one short
 transaction, which also notes the position.  If the process is killed, whole steps are done; the
@@ -61,7 +62,7 @@ Place = tuple[int | None, str | None]
 
 @dataclass
 class TrackerSplitter:
-    """Splitter of older batches by tracker, for missions with several trackers."""
+    """Splitter of recorded batches by tracker, for missions that got further trackers."""
 
     store: Store
     sky: SkyModel
@@ -131,7 +132,7 @@ class TrackerSplitter:
 
 
 class BackgroundUpgrade:
-    """Thread that upgrades data recorded by earlier versions, once.
+    """Thread that completes what was recorded earlier, once.
 
     It gives results their digests, then splits batches by tracker.
     """
@@ -264,7 +265,7 @@ def _write(
     connection.execute(update(tracker_splits).where(_is(owner)).values(last))
 
 
-# Digests for results of earlier versions, which recording computes by itself since schema 0017.
+# Digests for results of earlier versions, which recording now computes by itself.
 #
 # Results get digests in small steps, each in one short transaction with the seals of their hours.
 # If the process is killed, whole steps are done; the next call continues from there.  These digests
