@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
-from typing import Annotated, Self
+from typing import Annotated, NamedTuple, Self
 
 from pydantic import Field, StrictBool, model_validator
 
@@ -147,6 +147,14 @@ def about_zero(watch: float, warning: float, critical: float, hysteresis: float)
 
 Sample = tuple[int, float, float]
 """Sample of a quantity: (time_ns, part, whole), a fraction of counts, or a value over one."""
+
+
+class RecordedSample(NamedTuple):
+    """Sample of a batch as it was recorded, with the batch's place in the order of recording."""
+
+    sample: Sample
+    seq: int
+    batch_id: str
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from service.storage.queries.trends import RecordedSample
-from service.trends.limits import LimitSettings, Sample, Severity
+from service.trends.limits import LimitSettings, RecordedSample, Sample, Severity
 from service.vectors import Vector
 
 SLACK = 1e-9

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +19,7 @@ from service.storage.sql import tables
 from service.storage.sql.columns import Row
 from service.storage.sql.tables import batches, results, tracker_values
 from service.times import DAY_S, HOUR_S, Utc, bucket_start, shifted, unix_seconds, utc_now
-from service.trends.limits import Sample
+from service.trends.limits import RecordedSample, Sample
 from service.trends.measures import BatchShare, Rate, StarShare
 from service.trends.quantities import (
     QUANTITIES,
@@ -445,14 +445,6 @@ def _shown(
         values = {row["id"]: dict(row) for row in connection.execute(own).mappings()}
     value_of: Any = QUANTITIES[by].value_of
     return [RankedBatch(**summary_fields(rows[id]), value=value_of(values[id])) for id in ids]
-
-
-class RecordedSample(NamedTuple):
-    """Sample of a batch as it was recorded, with the batch's place in the order of recording."""
-
-    sample: Sample
-    seq: int
-    batch_id: str
 
 
 def samples_until(

@@ -6,8 +6,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from service.features.alarms.windows import Point, SampleWindow, largest_contribution
-from service.storage.queries.trends import RecordedSample
-from service.trends.limits import LimitSettings, Severity
+from service.trends.limits import LimitSettings, RecordedSample, Severity
 from service.trends.quantities import default_limits, limited_names
 
 S = 10**9
