@@ -111,14 +111,13 @@ def digest_of(sources: Iterable[str]) -> str:
         if any(path.is_relative_to(each) for each in left_out):
             continue
         digest.update(f"{os.path.relpath(path, ROOT)}\0".encode())
-        digest.update(_content_digest(path))
+        digest.update(_content_digest(path.read_bytes(), path.suffix))
     return digest.hexdigest()[:16]
 
 
 @cache
-def _content_digest(path: Path) -> bytes:
-    content = path.read_bytes()
-    if path.suffix == ".py":
+def _content_digest(content: bytes, suffix: str) -> bytes:
+    if suffix == ".py":
         content = repr(_syntax(ast.parse(content))).encode()
     return hashlib.sha256(content).digest()
 

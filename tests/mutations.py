@@ -262,7 +262,8 @@ class Readers:
         states = "".join(
             "<stateVector>"
             f"<EPOCH>2022-01-17T12:00:0{second}</EPOCH>"
-            + "".join(f"<{name}>{second + 1}.5</{name}>" for name in OEM_ELEMENTS)
+            + "".join(f"<{name}>{second + 7000}.5</{name}>" for name in OEM_ELEMENTS[:3])
+            + "".join(f"<{name}>1.0</{name}>" for name in OEM_ELEMENTS[3:])
             + "</stateVector>"
             for second in range(4)
         )

@@ -319,4 +319,4 @@ def test_messages_are_recorded_once_whichever_followers_are_killed(
         counted = connection.scalar(select(func.count()).select_from(batches))
     assert counted == expected + 2 * timed
     wait_until(lambda: service.app.store.progress.lag().results == 0)
-    assert sum(each.batches for each in service.app.fleet.rates("XTE")) == counted
+    assert sum(each.batches for each in service.app.spacecraft.rates("XTE")) == counted
