@@ -121,8 +121,8 @@ def revision_of(database: str) -> str | None:
 def check(database: str) -> list[str]:
     """List the differences between a database's schema and the tables of the code.
 
-    Nothing is written and nothing created: raises `BadConfiguration` where there is no database, or
-    one of a development version before 0.2.0.
+    It only reads.  Raises `BadConfiguration` where there is no database, or one of a development
+    version before 0.2.0.
     """
     with reading(database) as connection:
         if _is_of_development(revision_in(connection)):

@@ -183,7 +183,7 @@ def replay_page(id: str, query: FromQuery[PageQuery], context: ContextDep) -> Re
 
 
 def _later(replays: Sequence[Replay]) -> dict[str, Replay]:
-    """For each replay, newest first, the next replay of the same file into the same run."""
+    """The next replay of the same file into the same run, by the id of the one before."""
     newest: dict[tuple[str, str], Replay] = {}
     later = {}
     for each in replays:
