@@ -18,6 +18,7 @@ from msgspec.structs import replace
 
 from service import __version__
 from service.acquire.choices import aberration_velocity, choices_of
+from service.acquire.contradictions import doubts_of
 from service.acquire.result import (
     WORK_BOUND_HIT,
     Acquisition,
@@ -220,6 +221,12 @@ def _composed(
         trackers = tracker_results(corrected, in_zones.places, in_zones.identifications, solution)
         if solution is not None:
             warnings += warnings_of_attitude(solution, mission, prior)
+            doubts, is_contradicted = doubts_of(
+                search, solution, corrected, in_zones.identifications
+            )
+            warnings += doubts
+            if is_contradicted:
+                solution = replace(solution, suspect=True)
         if rival is not None:
             warnings.append(warning_of_rival(rival))
         attitude = in_zones.prior.attitude if solution is None else solution.matrix
@@ -260,7 +267,7 @@ def _measured(batch: ObservationBatch, mission: Mission, sky: SkyModel) -> Acqui
         solution=measured_solution(batch.measurement, mission),
         rival=None,
         reason=None,
-        warnings=(),
+        warnings=batch.remarks,
         timings_us=StepTimer().us,
         provenance=_provenance(sky, run_catalog, mission),
     )

@@ -13,15 +13,13 @@ from msgspec.structs import replace
 from service.acquire.result import RivalAttitude
 from service.acquire.search import SearchResult, find
 from service.acquire.zone_search import Search, ZoneResult, ZoneSearch
-from service.attitude.solution import AttitudeSolution
+from service.attitude.solution import DIFFERENT_CHI_SQUARE, AttitudeSolution
 from service.identify.hypotheses import groups
 from service.observations.calibrate import CorrectedColumns, CorrectedObservations
 from service.vectors import attitude_error_arcsec, read_only
 
 FEWEST_NAMED = 2
 """Least number of one tracker's stars that a second group must identify to have an attitude."""
-DIFFERENT_CHI_SQUARE = 30.0
-"""Chi-square (3 degrees of freedom) of the difference of equal attitudes at probability 1e-6."""
 
 
 def find_groups(

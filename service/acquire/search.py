@@ -9,7 +9,7 @@ from msgspec.structs import replace
 
 from service.acquire.result import PREDICTION_CONTRADICTED, WORK_BOUND_HIT, Path
 from service.acquire.zone_search import Search, ZoneResult, ZoneSearch
-from service.attitude.solution import AttitudeSolution, NoAttitude
+from service.attitude.solution import DIFFERENT_CHI_SQUARE, AttitudeSolution, NoAttitude
 from service.identify.attitude_from_matches import attitude_of
 from service.identify.budget import WorkBudget
 from service.identify.hypotheses.evidence import LOG_CLUTTER_SPAN, log_magnitudes
@@ -31,9 +31,6 @@ from service.vectors import (
     quaternion_from_matrix,
     read_only,
 )
-
-CONTRADICTED_CHI_SQUARE = 30.0
-"""Chi-square (3 degrees of freedom) of a correct prediction's error at probability 1e-6."""
 
 
 class SearchResult(Struct, frozen=True, eq=False, gc=False):
@@ -235,7 +232,7 @@ def contradicts(in_zones: ZoneResult, prior: PriorAttitude) -> bool:
     apart_arcsec = attitude_error_arcsec(solved.matrix, prior.attitude)
     covariance_arcsec2 = predicted.covariance_arcsec2 + solved.covariance_arcsec2
     weighted = float(apart_arcsec @ np.linalg.solve(covariance_arcsec2, apart_arcsec))
-    return weighted > CONTRADICTED_CHI_SQUARE
+    return weighted > DIFFERENT_CHI_SQUARE
 
 
 def _whole_sky_can_tell(corrected: Sequence[CorrectedObservations]) -> bool:

@@ -22,6 +22,8 @@ WORST_AXIS_DEG = 1.0
 WORST_AXIS_RAD = math.radians(WORST_AXIS_DEG)
 SUSPECT_TAIL = 0.001
 """Probability that the TASTE of a correct solution exceeds the bound for suspicion."""
+DIFFERENT_CHI_SQUARE = 30.0
+"""Chi-square (3 degrees of freedom) of the difference of equal attitudes at probability 1e-6."""
 ODDS_OF_TWO = 100.0
 """Least likelihood ratio for which one of two trackers is named as the faulty one."""
 METHODS = ("triad", "quest")
