@@ -187,6 +187,10 @@ class BatchMaker:
             self._pending = None
             yield pending
 
+    def rates_near(self, moment: clock.Moment) -> list[float] | None:
+        """Body rates in deg/s of a packet read so far, near enough to a moment; otherwise None."""
+        return self._state["rates"].near(moment)
+
     def end(self) -> Iterator[StarBatch]:
         """Yield the unfinished batch, which waited for further trackers."""
         pending, self._pending = self._pending, None
@@ -341,11 +345,21 @@ class MeasuredBatch:
 
 
 class MeasurementMaker:
-    """Converts packet values of one spacecraft to batches of measured attitudes."""
+    """Converts packet values of one spacecraft to batches of measured attitudes.
 
-    def __init__(self, spacecraft: str, mapped: PacketMap) -> None:
+    `rates_near` gives the body rates in deg/s at a moment: without them nothing tells how far the
+    body turned between two attitudes.
+    """
+
+    def __init__(
+        self,
+        spacecraft: str,
+        mapped: PacketMap,
+        rates_near: Callable[[clock.Moment], list[float] | None],
+    ) -> None:
         self._spacecraft = spacecraft
         self._mapped = mapped
+        self._rates_near = rates_near
 
     def add(self, packet: SpacePacket, values: Mapping[str, Any]) -> Iterator[MeasuredBatch]:
         """Yield the measured attitudes in a packet; raises `PacketFault`."""
@@ -363,6 +377,8 @@ class MeasurementMaker:
             names = columns.sigma or columns.covariance or names
         elif fault.field == "time":
             names = clock.names_of(columns.table.time or self._mapped.table.time)
+        elif fault.field.startswith("body_rates_deg_per_s"):
+            names = self._mapped.rates or self._mapped.gyro
         return ", ".join(names)
 
     def _body(
@@ -388,10 +404,13 @@ class MeasurementMaker:
                 values, columns.sigma, columns.arcsec
             )
         axes = table.tracker or "body"
-        return {
+        body: dict[str, Any] = {
             "spacecraft": self._spacecraft,
             "batch": f"{packet.apid}-{moment.text}-{packet.sequence_count}-{axes}",
             "time": moment.text,
             "a_priori": None,
             "measurement": measured,
         }
+        if (rates := self._rates_near(moment)) is not None:
+            body["body_rates_deg_per_s"] = rates
+        return body

@@ -100,7 +100,7 @@ class PacketReader:
         self._definition = definition
         mapped = packet_map(mission.packets, definition)
         self._maker = BatchMaker(mission.name, mapped)
-        self._measured = MeasurementMaker(mission.name, mapped)
+        self._measured = MeasurementMaker(mission.name, mapped, self._maker.rates_near)
         self._gyro = GyroBlockMaker(mission, mapped) if mission.packets.gyro_blocks else None
         self._asked = frozenset(mission.packets.apids)
         self._sequence = SequenceCounter()

@@ -41,6 +41,7 @@ MEASURED = """
 quaternion = ["Q1", "Q2", "Q3", "Q4"]
 """
 SIGMAS = 'sigma = ["SIG_X", "SIG_Y", "SIG_Z"]\n'
+RATES = '[packets.rates]\ncomponents = ["SIG_X", "SIG_Y", "SIG_Z"]\n'
 UPPER = 'covariance = ["P_1", "P_2", "P_3", "P_4", "P_5", "P_6"]\n'
 
 
@@ -113,6 +114,23 @@ def test_accuracies_are_of_the_unit_that_the_table_names(unit, arcsec):
     assert by_covariance == pytest.approx(np.array(rows), rel=1e-6)
     constant = measured_by(MEASURED + "sigma_arcsec = [6.0, 6.0, 40.0]\n", body)
     assert constant.measurement.covariance_arcsec2 == pytest.approx(np.diag([36.0, 36.0, 1600.0]))
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("deg_per_s", 1.0), ("rad_per_s", 57.29577951308232)])
+def test_rates_of_the_packets_go_with_measured_attitudes(unit, scale):
+    """A body at 36 deg/s with an attitude every ten seconds would look still without them."""
+    table = MEASURED + "sigma_arcsec = [6.0, 6.0, 40.0]\n" + RATES + f'unit = "{unit}"\n'
+    batch = measured_by(table, packed(THIRTY_DEG, sigmas=(0.1, -0.2, 0.6)))
+    assert batch.body_rates_deg_per_s == pytest.approx(scale * np.array([0.1, -0.2, 0.6]))
+    without = measured_by(MEASURED + SIGMAS, packed(THIRTY_DEG))
+    assert not without.body_rates_deg_per_s.any()
+
+
+def test_rates_that_no_body_has_are_refused_by_their_parameters():
+    table = MEASURED + "sigma_arcsec = [6.0, 6.0, 40.0]\n" + RATES
+    (line,), _ = read(table, packed(THIRTY_DEG, sigmas=(0.0, 0.0, 9999.0)))
+    assert "SIG_X, SIG_Y, SIG_Z" in line.fault.field
+    assert "body_rates_deg_per_s" in line.fault.message
 
 
 def test_a_tracker_s_axes_are_turned_by_its_alignment(sky):
