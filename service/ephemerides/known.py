@@ -1,5 +1,6 @@
 """Attitudes or orbital states from a file, interpolated at a given time."""
 
+import math
 from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -26,6 +27,12 @@ FILL_RAD = 0.05
 """Least jump in radians to the identity that marks it as a fill value."""
 STILL_RAD = 1e-5
 """Rotation in radians between records above which rates of zero count as missing."""
+MISSED_RAD, MISSED_SHARE = math.radians(0.05), 0.5
+"""Least difference, in radians and as a share, of a step from its rates that contradicts them."""
+MEANT_SHARE = 0.1
+"""Largest share of that difference that is left where rates are meant in another sign or unit."""
+FEWEST_STEPS = 3
+"""Least number of steps between records that tell whether rates and attitudes agree."""
 
 
 @dataclass(frozen=True)
@@ -132,6 +139,7 @@ def known_attitudes(file: str, object_name: str, segments: Sequence[Segment]) ->
         raise BadFile(Fault(file, "has no attitude"))
     for each in segments:
         _require_no_fill(file, each)
+        _require_own_rates(file, each)
     return KnownAttitudes(object_name, in_order(file, segments))
 
 
@@ -162,6 +170,34 @@ def _require_no_fill(file: str, segment: Segment) -> None:
             jump_deg = np.degrees(min(jumps))
             message = f"is the identity, {jump_deg:.3g} degrees from its neighbours: no attitude?"
             raise BadFile(Fault(f"{file}, {segment.place}, record {row + 1}", message))
+
+
+def _require_own_rates(file: str, segment: Segment) -> None:
+    """Raise `BadFile` for rates that fit the attitudes in another sign or unit only.
+
+    Steps of more than a quarter turn, which a body may make either way, are left to the
+    interpolation, as are rates that fit in no way.
+    """
+    q, rate = segment.quaternion, segment.rate_rad_s
+    if rate is None or segment.discrete:
+        return
+    step_s = np.diff(segment.time_ns)[:, None] * 1e-9
+    turned, told = rotation_vectors(q[:-1], q[1:]), 0.5 * (rate[1:] + rate[:-1]) * step_s
+    by_steps, by_rates, missed = (np.linalg.norm(v, axis=1) for v in (turned, told, turned - told))
+    larger = np.maximum(by_steps, by_rates)
+    near = larger <= QUARTER_TURN_RAD
+    wrong = near & (missed > np.maximum(MISSED_RAD, MISSED_SHARE * larger))
+    count, steps = int(wrong.sum()), int(near.sum())
+    if steps < FEWEST_STEPS or 2 * count <= steps:
+        return
+    for factor, words in ((-1.0, "of the opposite sign"), (math.degrees(1.0), "in rad/s")):
+        other = np.linalg.norm(turned - factor * told, axis=1)
+        if np.median(other[wrong]) < MEANT_SHARE * np.median(missed[wrong]):
+            message = (
+                f"do not lead from one attitude to the next in {count} of {steps} steps, and do "
+                f"if they are {words}"
+            )
+            raise BadFile(Fault(f"{file}, {segment.place}, rates", message))
 
 
 def _angle_rad(one: Vector, other: Vector) -> float:

@@ -43,6 +43,31 @@ def test_rates_of_a_row_tell_how_often_the_body_turned(tmp_path):
     assert np.isnan(without.at(segment.time_ns[:1] + 5 * 10**9)).all()
 
 
+@pytest.mark.parametrize(
+    ("rate", "words"),
+    [
+        (-0.5, "in 6 of 6 steps, and do if they are of the opposite sign"),
+        (0.5 * np.pi / 180.0, "in 6 of 6 steps, and do if they are in rad/s"),
+        (0.5, None),
+        # Rates that fit in no way are left to the interpolation.
+        (2.0, None),
+    ],
+)
+def test_rates_that_lead_elsewhere_than_the_attitudes_are_refused(rate, words, tmp_path):
+    """Half a degree a second and ten seconds: neither way round is in doubt."""
+    cells = [
+        f"1996-01-10T12:{k // 6:02d}:{10 * k % 60:02d}Z,"
+        + ",".join(map(repr, (*about_z(5.0 * k).tolist(), 0.0, 0.0, float(rate))))
+        for k in range(7)
+    ]
+    text = "\n".join([ROWS.splitlines()[0], *cells])
+    if words is None:
+        assert len(read(text, tmp_path)) == 7
+        return
+    with pytest.raises(BadFile, match=f"line 2, rates: do not lead from one .* {words}"):
+        read(text, tmp_path)
+
+
 @pytest.mark.parametrize("text", [SPUN, V2], ids=["csv", "aem"])
 def test_files_packed_with_gzip_are_read(text, tmp_path):
     plain, packed = (read(each, tmp_path) for each in (text, gzip.compress(text.encode())))
