@@ -1,5 +1,6 @@
 """`acquire simulate frames` and `acquire frame`: from nothing to an attitude with its picture."""
 
+import gzip
 import json
 
 import pytest
@@ -32,6 +33,16 @@ def test_frames_are_drawn_and_their_attitudes_found(acquire, frames, tmp_path):
     assert [each["batch"] for each in answers] == [each["batch"] for each in truth]
     for answer, true in zip(answers, truth, strict=True):
         assert answer["attitude"]["quaternion"] == pytest.approx(true["quaternion"], abs=1e-4)
+
+
+def test_the_metadata_of_a_packed_frame_lie_beside_it(acquire, frames, tmp_path):
+    packed, beside = (tmp_path / f"packed.{end}" for end in ("fits.gz", "json"))
+    packed.write_bytes(gzip.compress(frames[0].read_bytes(), 1))
+    beside.write_text(
+        json.dumps({**json.loads(frames[0].with_suffix(".json").read_text()), "batch": "own"})
+    )
+    code, out, _ = acquire("frame", packed, "--spacecraft", "IMAGER", "--in-process", "--json")
+    assert (code, json.loads(out)["batch"]) == (0, "own")
 
 
 def test_a_file_that_is_refused_is_told_and_the_others_go_on(acquire, frames, tmp_path):

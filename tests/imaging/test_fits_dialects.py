@@ -153,6 +153,30 @@ TIMES = {
         {},
         2.0,
     ),
+    "milliseconds in a COMMENT": (
+        {"DATE-OBS": NOON, "EXPTIME": 4000, "COMMENT": "Exposure times are given in milliseconds"},
+        {},
+        2.0,
+    ),
+    "another time in milliseconds": (
+        {"DATE-OBS": NOON, "EXPTIME": 4.0, "HISTORY": "exposure corrected by 30 ms of shutter"},
+        {},
+        2.0,
+    ),
+    "a zone in a COMMENT": (
+        {
+            "DATE-OBS": "2026-03-01T21:00:00",
+            "EXPTIME": 4.0,
+            "COMMENT": "All times are in local time, UTC+9",
+        },
+        {},
+        2.0,
+    ),
+    "local in another sense": (
+        {"DATE-AVG": NOON, "COMMENT": "flat field of this date; local sky subtracted"},
+        {},
+        0.0,
+    ),
     "TAI by the comment": ({"DATE-AVG": ("2026-03-01T12:00:37", "TAI")}, {}, 0.0),
     "UTC of a receiver of GPS": ({"DATE-AVG": (NOON, "UTC from GPS")}, {}, 0.0),
     "MJD in TT": ({"MJD-AVG": 61100.5 + 69.184 / 86400, "TIMESYS": "TT"}, {}, 0.0),
@@ -211,6 +235,11 @@ NO_TIMES = {
         {"DATE-OBS": (NOON, "Local time of start of exposure"), "EXPTIME": 1.0},
         "DATE-OBS is local time by its comment",
     ),
+    "local time by a COMMENT": (
+        {"DATE-OBS": NOON, "EXPTIME": 1.0, "COMMENT": "DATE-OBS is local time"},
+        "DATE-OBS is local time by its comment (DATE-OBS is local time)",
+    ),
+    "local time in French": ({"DATE-AVG": (NOON, "heure locale")}, "is local time by its comment"),
     "the time of a zone": ({"DATE-AVG": (NOON, "CEST")}, "is local time by its comment (CEST)"),
     "local time with a Z": ({"DATE-AVG": (NOON + "Z", "local time")}, "UTC by its Z"),
     "local time and UTC": ({"DATE-AVG": (NOON, "UTC or local time")}, "not clearly UTC or local"),

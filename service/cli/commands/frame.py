@@ -15,8 +15,9 @@ from service.settings import Settings
 
 SIDECAR = """\
 The metadata of a frame are in a JSON file of its name beside it, FILE.json for
-FILE.fits, as `acquire simulate frames` writes it: the fields of a batch except its stars
-(time, a_priori, body_rates_deg_per_s, ...).  Options of the command override them."""
+FILE.fits or FILE.fits.gz, as `acquire simulate frames` writes it: the fields of a batch
+except its stars (time, a_priori, body_rates_deg_per_s, ...).  Options of the command
+override them."""
 
 
 def add(commands: Any) -> None:
@@ -107,7 +108,8 @@ def run(parsed: Namespace) -> int:
 def _known(parsed: Namespace, file: Path) -> dict[str, Any]:
     """Metadata of a frame: from the JSON file next to it, overridden by options."""
     known: dict[str, Any] = {}
-    beside = file.with_suffix(".json")
+    plain = file.with_name(file.name.removesuffix(".gz").removesuffix(".fz"))
+    beside = plain.with_suffix(".json")
     if beside.is_file():
         known = _object(beside.read_text(encoding="utf-8-sig"), str(beside))
     if parsed.a_priori is not None:

@@ -18,10 +18,14 @@ Value = bool | int | float | str | None
 
 @dataclass(frozen=True)
 class Header:
-    """A FITS header: the values of its cards by keyword, and the comments that are not empty."""
+    """A FITS header: the values of its cards by keyword, and the comments that are not empty.
+
+    `notes` are the texts of its COMMENT and HISTORY cards.
+    """
 
     cards: dict[str, Value]
     comments: dict[str, str] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
 
     def whole(self, key: str, default: int | None = None, least: int = 0) -> int:
         """The whole number of a header keyword; raises `BadFile` for any other value."""
@@ -46,7 +50,8 @@ class Header:
 
     def behind(self, primary: "Header") -> "Header":
         """A header with the cards that it lacks taken from the primary header."""
-        return Header(primary.cards | self.cards, primary.comments | self.comments)
+        notes = self.notes if primary is self else [*self.notes, *primary.notes]
+        return Header(primary.cards | self.cards, primary.comments | self.comments, notes)
 
     @property
     def is_compressed(self) -> bool:
@@ -145,7 +150,9 @@ def read_header(file: BoundedFile) -> Header:
             key = card[:8].rstrip()
             if key == "END":
                 return header
-            if card[8:10] == "= " and key not in header.cards:
+            if key in ("COMMENT", "HISTORY"):
+                header.notes.append(card[8:].strip())
+            elif card[8:10] == "= " and key not in header.cards:
                 header.cards[key], comment = _value(card[10:])
                 if comment:
                     header.comments[key] = comment

@@ -82,9 +82,19 @@ _ROLES = {
 }
 _OTHER_MOMENTS = re.compile(r"\b(written|saved|creat\w+|download\w*|readout|read out)\b")
 _LOCAL = re.compile(
-    r"(?i:\b(local|civil|wall.?clock)\b)|\b(LT|LST|JST|IST|KST|CET|CEST|EET|EEST|BST|MSK|AEST|AEDT|"
+    r"(?i:\b(locale?|civil|wall.?clock|ortszeit)\b)|"
+    r"\b(LT|LST|JST|IST|KST|CET|CEST|MEZ|MESZ|EET|EEST|BST|MSK|AEST|AEDT|"
     r"[ECMP][SD]T|HST|AKST|NZST)\b|\b(Beijing|Moscow|Tokyo) time\b"
 )
+_NOTED_LOCAL = re.compile(
+    r"(?i)\b(times|dates?|clock|timestamps?|date-\w+|time-obs)\b.*\b(is|are|in)\b.*\blocal\b"
+)
+_NOTED_UNIT = re.compile(
+    r"(?i)\b(exptime|exposure|xposure|exposure times?)\b"
+    r"(?: |is|are|given|stated|values?|units?|in|of|[:=(\[])*"
+    r"\b(milliseconds?|msec|ms|microseconds?|usec|us|minutes?|hours?)\b"
+)
+"""Texts of COMMENT and HISTORY cards about the dates and the exposures of a FITS header."""
 _IS_UTC = re.compile(r"\b(UTC|UT|GMT|universal)\b", re.IGNORECASE)
 _ZONE = re.compile(r"\b(?:UTC|UT|GMT)\s*([+-])\s*(\d{1,2})(?::?([0-5]\d))?(?![\d-])")
 _SCALE_WORDS = re.compile(r"\b(TAI|TT|TDT|TDB|GPS)\b")
@@ -184,6 +194,8 @@ def _seconds(header: Header, key: str) -> tuple[float, str]:
     Raises `ValueError` for a value or unit that cannot be read.
     """
     value, comment = header.cards[key], header.comments.get(key, "")
+    if not _stated_scales(comment, key):
+        comment = _noted(header, _NOTED_UNIT) or comment
     match = _NUMBER.fullmatch(value) if isinstance(value, str) else None
     if match is not None:
         number, unit = match[1].upper().replace("D", "E"), match[2]
@@ -220,6 +232,11 @@ def _stated_scales(comment: str, key: str) -> set[float]:
     words = [found[1] or found[2] for found in _UNIT_WORDS.finditer(text)]
     words += [found[1] for found in _PARENTHESES.finditer(text)]
     return {_UNITS_S[word] for word in words if word in _UNITS_S}
+
+
+def _noted(header: Header, words: re.Pattern[str]) -> str:
+    """The first COMMENT or HISTORY of a FITS header that matches, empty if none does."""
+    return next((note for note in header.notes if words.search(note)), "")
 
 
 class _NoTime(Exception):
@@ -406,6 +423,7 @@ class _DateCards:
         Raises `_LocalTime` for a local time with an unknown offset.
         """
         value, comment = self.header.cards[key], self._comment(key)
+        comment = f"{comment} {_noted(self.common, _NOTED_LOCAL)}".strip()
         zone = _ZONE.search(comment)
         own = _CLOCK.search(value) if isinstance(value, str) else None
         if zone is None and not _LOCAL.search(comment):
