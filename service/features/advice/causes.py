@@ -50,8 +50,8 @@ LEAST_STARS, LEAST_BATCHES = 20, 5
 FALSE_SHARE = 0.02
 USUAL_SHARE = 0.15
 """Normal share of batches with a priori errors beyond the zone, not reported as a cause."""
-OVER_SHARE, OVER_BATCHES = 0.1, 6
-"""Last batches without a cause after which it is over: a share of all, but at least a number."""
+OVER_CHANCE = 0.001
+"""Chance below which no batch at the end of a period has a cause that lasts."""
 
 Flags = npt.NDArray[np.bool_]
 
@@ -259,17 +259,29 @@ def causes(now: StarTable, before: StarTable | None) -> list[Cause]:
 
 def _cause(factor: Factor, now: StarTable, hit: Flags, explained: Flags) -> Cause:
     count, lost = int(np.count_nonzero(hit)), int(np.count_nonzero(now.outcome != "u"))
-    last = int(np.flatnonzero(explained)[-1])
-    after = now.batches - 1 - last
-    is_over = after >= max(OVER_BATCHES, OVER_SHARE * now.batches)
+    last_s = float(unix_seconds(now.time_ns[explained])[-1])
     return Cause(
         batches=int(np.count_nonzero(explained)),
         text=factor.text,
         evidence=factor.evidence,
         remedy=factor.remedy,
         effect=f"{count} of {lost} ambiguous or unmatched stars.",
-        over_since=utc_of_unix(float(unix_seconds(now.time_ns[last]))).text if is_over else None,
+        over_since=utc_of_unix(last_s).text if is_over(explained, now.time_ns) else None,
     )
+
+
+def is_over(explained: Flags, time_ns: npt.NDArray[np.int64]) -> bool:
+    """True if a cause is over: the last batches (b,) without it are more than chance and a pause.
+
+    The chance is that of a random order of the batches, in which none of the last ones has the
+    cause; a cause that came back after a pause as long as the time since it was seen may again.
+    """
+    places = np.flatnonzero(explained)
+    left = len(explained) - np.arange(len(places))
+    quiet = len(explained) - 1 - places[-1]
+    pause_ns = np.max(np.diff(time_ns[places]), initial=0)
+    chance = np.prod(1.0 - quiet / left)
+    return bool(chance < OVER_CHANCE and time_ns[-1] - time_ns[places[-1]] > pause_ns)
 
 
 def _a_priori(now: StarTable, before: StarTable | None) -> Iterator[Factor]:

@@ -3,9 +3,11 @@
 import json
 import re
 
+import numpy as np
 import pytest
+from scipy.stats import hypergeom
 
-from service.features.advice.causes import LEAST_BATCHES
+from service.features.advice.causes import LEAST_BATCHES, is_over
 from service.features.advice.part import AdviceService
 from service.observations.schema import submission_from_json
 from service.simulate.stretches import NO_TROUBLES, Pass
@@ -124,6 +126,28 @@ def test_a_cause_that_ended_says_since_when(app, missions, seed):
     assert cause.over_since is not None
     last = shifted(begin, BATCHES * 600.0).text
     assert BEGIN < cause.over_since < last
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3, 0.9, 1.0])
+def test_a_cause_is_over_beyond_one_chance_in_a_thousand(share):
+    """The chance is scipy's, of none among the last batches in a random order."""
+    count = 100
+    for quiet in range(1, 90):
+        explained = np.diff(np.floor(share * np.arange(count + 1))) > 0
+        explained = np.append(explained, np.zeros(quiet, bool))
+        last = np.flatnonzero(explained)[-1]
+        after = len(explained) - 1 - last
+        chance = hypergeom.pmf(0, len(explained), explained.sum(), after)
+        assert is_over(explained, np.arange(len(explained))) == (chance < 0.001), quiet
+
+
+def test_a_cause_that_lasts_is_hardly_ever_called_over(rng):
+    """Also where it comes and goes: no longer than it was away before is it away now."""
+    masks = rng.random((5000, 72)) < rng.uniform(0.1, 0.9, (5000, 1))
+    found = [is_over(each, np.arange(72)) for each in masks if each.sum() >= LEAST_BATCHES]
+    assert np.mean(found) < 0.002
+    comes_and_goes = np.tile(np.repeat([True, False], 12), 3)
+    assert not is_over(comes_and_goes, np.arange(72))
 
 
 def test_a_period_without_batches_has_no_parts(app):
