@@ -293,7 +293,7 @@ def test_an_outlier_is_marked_at_the_edge_unless_all_values_are_asked_for(browse
     label = "document.querySelector('[data-chart=residual]').getAttribute('aria-label')"
     with Server(create_app(app)) as url:
         browser.open(f"{url}/spacecraft/XTE")
-        browser.wait(lambda: "at the edge: 1 beyond it" in text(browser, readout))
+        browser.wait(lambda: "▲ 1 beyond the edge, the farthest" in text(browser, readout))
         assert "greatest 900″" in browser.run(label)
         for y in ("all", "log"):
             choose = (
@@ -302,7 +302,7 @@ def test_an_outlier_is_marked_at_the_edge_unless_all_values_are_asked_for(browse
             )
             browser.run(choose.replace("Y", y))
             browser.wait(lambda y=y: f"y={y}" in browser.run("location.search"))
-            browser.wait(lambda: "at the edge" not in text(browser, readout))
+            browser.wait(lambda: "beyond the edge" not in text(browser, readout))
             assert faults(browser) == []
         browser.call("Page.navigate", url="about:blank")
     browser.complaints.clear()

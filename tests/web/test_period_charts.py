@@ -16,7 +16,7 @@ from service.times import parse_utc, shifted
 from service.vectors import angle_between_deg, from_ra_dec, quaternion_from_matrix
 from service.web.console.charts.all_sky import EDGE, HEIGHT, WIDTH, all_sky_chart, hammer
 from service.web.console.charts.attitude import attitude_charts
-from service.web.console.charts.focal_plane import focal_plane_map
+from service.web.console.charts.focal_plane import LONGEST, focal_plane_map
 from service.web.console.charts.histogram import magnitude_chart, residual_histogram
 
 START = parse_utc("1999-03-01T00:00:00Z")
@@ -210,6 +210,37 @@ def test_without_values_there_is_no_chart(rng):
     assert attitude_charts(empty, START, shifted(START, 60.0)) == []
 
 
+def length_of(path):
+    """Length of the first line of an arrow's path."""
+    found = re.match(r"M\S+ \S+?l(\S+) ([^M]+)", path)
+    return np.hypot(*map(float, found.groups())) if found else 0.0
+
+
+def test_a_wrong_star_leaves_the_arrows_of_all_others_readable(rng):
+    """It is drawn as long as an arrow may be, and its residual stands beside."""
+    plain = tracker_of(rng, 2000)
+    before = focal_plane_map(plain)
+    residual = plain.residual_arcsec.copy()
+    residual[0] = [2991.0, 0.0]
+    drawn = focal_plane_map(replace(plain, residual_arcsec=residual))
+    (wrong,) = [each for each in drawn.cells if each.is_cut and each.mean_arcsec[0] > 20.0]
+    assert drawn.cut_arcsec[0] == pytest.approx(np.hypot(*wrong.mean_arcsec))
+    assert length_of(wrong.arrow) == pytest.approx(LONGEST * drawn.side, abs=0.2)
+    usual = [np.median([length_of(each.arrow) for each in map.cells]) for map in (before, drawn)]
+    assert usual[1] > 0.5 * usual[0]
+
+
+def test_a_wrong_magnitude_is_marked_at_the_edge_of_the_others_range(rng):
+    plain = tracker_of(rng)
+    observed = plain.observed_mag.copy()
+    observed[:2] = 14.0, -3.0
+    drawn = magnitude_chart(replace(plain, observed_mag=observed))
+    assert drawn.ticks == magnitude_chart(plain).ticks
+    assert drawn.beyond_mag == (14.0, -3.0)
+    assert drawn.beyond.count("M") == 2
+    assert drawn.stars == 4000
+
+
 # ---- attitude and rate ---------------------------------------------------------------------------
 
 
@@ -253,3 +284,20 @@ def test_no_line_and_no_rate_over_a_gap():
     charts = attitude_charts(alone, START, shifted(START, 200.0))
     assert [chart.id for chart in charts] == ["attitude", "sigma"]
     assert charts[0].panels[0].dots.count("M") == 20
+
+
+def test_a_suspect_attitude_far_from_the_others_is_marked_at_the_edge():
+    quiet = attitudes_of(turning(np.array([0.0, 0.0, 0.001]), 20))
+    far = quiet.quaternion.copy()
+    far[5] = quaternion_from_matrix(Rotation.random(random_state=2).as_matrix())
+    status = tuple("suspect" if k == 5 else "good" for k in range(20))
+    wrong = replace(quiet, quaternion=far, status=status)
+    for chart, plain in zip(
+        attitude_charts(wrong, START, shifted(START, 200.0)),
+        attitude_charts(quiet, START, shifted(START, 200.0)),
+        strict=True,
+    ):
+        for panel, before in zip(chart.panels, plain.panels, strict=True):
+            assert panel.high == pytest.approx(before.high, rel=0.1, abs=1e-9)
+            assert (panel.farthest is not None) == (chart.id != "sigma")
+            assert panel.suspect.count("M") == (2 if chart.id == "rate" else 1)

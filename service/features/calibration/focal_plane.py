@@ -6,7 +6,14 @@ from dataclasses import dataclass
 from typing import Literal
 
 from service.features.calibration.records import ResidualCell, ResidualMap
-from service.web.console.charts.focal_plane import LEAST_STARS, SIZE, arrow, round_below
+from service.web.console.charts.focal_plane import (
+    LEAST_STARS,
+    SIZE,
+    arrow,
+    cut,
+    longest_drawn,
+    round_below,
+)
 
 LONGEST_RESIDUAL = 1.3
 """Length of the longest arrow of a residual chart, in cells."""
@@ -25,6 +32,8 @@ class ResidualPicture:
     """Left and upper edge of each cell of the chart, and its number of stars."""
     side: float
     arrows: str
+    cut_arrows: str
+    """Arrows of residuals that are longer than drawn."""
     key_arcsec: float
     key_px: float
     size: float = SIZE
@@ -48,23 +57,25 @@ def _of(cell: ResidualCell, side: str) -> Sequence[float]:
 
 
 def _longest(cells: Sequence[ResidualCell], side: str) -> float:
-    lengths = (math.hypot(*_of(each, side)) for each in cells if each.stars >= LEAST_STARS)
-    return max(lengths, default=0.0)
+    return longest_drawn(
+        [math.hypot(*_of(each, side)) for each in cells if each.stars >= LEAST_STARS]
+    )
 
 
 def _picture(title: str, map: ResidualMap, side: Side, longest: float) -> ResidualPicture:
     px_per_deg = SIZE / (2.0 * map.radius_deg)
     cell_px = map.step_deg * px_per_deg
     px_per_arcsec = LONGEST_RESIDUAL * cell_px / longest if longest else 0.0
-    cells, arrows = [], []
+    cells, arrows = [], {False: "", True: ""}
     for each in map.cells:
         x = (each.h_deg + map.radius_deg) * px_per_deg
         y = SIZE - (each.v_deg + map.radius_deg) * px_per_deg
         cells.append((x - cell_px / 2.0, y - cell_px / 2.0, each.stars))
         if each.stars >= LEAST_STARS:
             h, v = _of(each, side)
-            along, down = h * px_per_arcsec, -v * px_per_arcsec
-            arrows.append(arrow(x - along / 2.0, y - down / 2.0, along, down))
+            scaled = h * px_per_arcsec, -v * px_per_arcsec
+            along, down, is_cut = cut(*scaled, LONGEST_RESIDUAL * cell_px)
+            arrows[is_cut] += arrow(x - along / 2.0, y - down / 2.0, along, down)
     key_arcsec = round_below(longest)
     return ResidualPicture(
         title=title,
@@ -72,7 +83,8 @@ def _picture(title: str, map: ResidualMap, side: Side, longest: float) -> Residu
         radius_deg=map.radius_deg,
         cells=tuple(cells),
         side=cell_px,
-        arrows="".join(arrows),
+        arrows=arrows[False],
+        cut_arrows=arrows[True],
         key_arcsec=key_arcsec,
         key_px=key_arcsec * px_per_arcsec,
     )

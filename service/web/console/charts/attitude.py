@@ -32,6 +32,8 @@ class Panel:
     suspect: str
     low: float
     high: float
+    farthest: float | None
+    """Farthest value of a suspect attitude beyond the others; None if there is none."""
     median_sigma: float | None
 
 
@@ -58,6 +60,11 @@ class _Values:
     sigma: Vector | None
     is_suspect: Mask
     joins: Mask
+
+    @property
+    def fits(self) -> Mask:
+        """Mask of the values that set the scale: all but suspect ones, which may be anywhere."""
+        return self.is_suspect if self.is_suspect.all() else ~self.is_suspect
 
 
 def attitude_charts(attitudes: PeriodAttitudes, start: Utc, end: Utc) -> list[AttitudeChart]:
@@ -130,7 +137,7 @@ _TITLES = {
 
 
 def _chart(id: str, values: _Values, time: TimeAxis) -> AttitudeChart:
-    unit, scale = _unit(id, values.value)
+    unit, scale = _unit(id, values.value[values.fits])
     panels = tuple(_panel(axis, values, time, scale, from_zero=id == "sigma") for axis in range(3))
     return AttitudeChart(
         id=id,
@@ -156,11 +163,14 @@ def _unit(id: str, values: Vector) -> tuple[str, float]:
 def _panel(axis: int, values: _Values, time: TimeAxis, unit: float, *, from_zero: bool) -> Panel:
     value = values.value[:, axis] * unit
     sigma = np.zeros_like(value) if values.sigma is None else values.sigma[:, axis] * unit
-    low = 0.0 if from_zero else float(np.min(value - sigma))
-    scale = Scale(low, float(np.max(value + sigma)))
+    fits = values.fits
+    low = 0.0 if from_zero else float(np.min((value - sigma)[fits]))
+    scale = Scale(low, float(np.max((value + sigma)[fits])))
+    beyond = value[(value < scale.low) | (value > scale.high)]
     drawn = Values(values.time_ns, value, values.joins).trace("", time, scale)
-    is_wide = float(np.max(sigma)) / scale.range_with_room * HEIGHT > LEAST_BAND
+    is_wide = float(np.max(sigma[fits])) / scale.range_with_room * HEIGHT > LEAST_BAND
     x, at = time.x(values.time_ns[values.is_suspect]), scale.y(value[values.is_suspect])
+    at = np.clip(at, 9, HEIGHT - 6)
     return Panel(
         axis=AXES[axis],
         line=drawn.line,
@@ -171,7 +181,8 @@ def _panel(axis: int, values: _Values, time: TimeAxis, unit: float, *, from_zero
         suspect="".join(
             f"M{a} {b - 9}l8 15h-16z" for a, b in zip(x.tolist(), at.tolist(), strict=True)
         ),
-        low=float(np.min(value)),
-        high=float(np.max(value)),
+        low=float(np.min(value[fits])),
+        high=float(np.max(value[fits])),
+        farthest=float(beyond[np.argmax(np.abs(beyond))]) if len(beyond) else None,
         median_sigma=None if values.sigma is None else float(np.median(sigma)),
     )

@@ -1,6 +1,7 @@
 """Map of a tracker's residuals over its focal plane in a period."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +21,22 @@ CLEAR = 3.3
 STEPS = (1.25, 1.5, 2.0, 3.0)
 """Ratios of spread to expected spread at which a cell gets the next shade."""
 ROUND = (1.0, 2.0, 5.0)
+OUTLIER = 3.0
+"""Length in medians beyond which an arrow is cut: a single wrong star leaves the others visible."""
+
+
+def longest_drawn(lengths: Sequence[float]) -> float:
+    """Residual of the longest arrow of a picture; longer ones are cut to it, see `cut`."""
+    longest = max(lengths, default=0.0)
+    return min(longest, OUTLIER * float(np.median(lengths)) or longest) if longest else 0.0
+
+
+def cut(along: float, down: float, most_px: float) -> tuple[float, float, bool]:
+    """Arrow in pixels of at most a length, in its own direction; true if it was longer."""
+    length = math.hypot(along, down)
+    if length <= most_px * 1.000001:
+        return along, down, False
+    return along * most_px / length, down * most_px / length, True
 
 
 @dataclass(frozen=True)
@@ -40,6 +57,8 @@ class Cell:
     shade: int
     arrow: str
     """SVG path of the arrow for the mean residual; empty with too few stars."""
+    is_cut: bool
+    """True if the mean residual is longer than its arrow."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +76,12 @@ class FocalPlaneMap:
     size: float = SIZE
     steps: tuple[float, ...] = STEPS
 
+    @property
+    def cut_arcsec(self) -> list[float]:
+        """Mean residuals that are longer than their arrows, the longest first."""
+        lengths = [math.hypot(*each.mean_arcsec) for each in self.cells if each.is_cut]
+        return sorted(lengths, reverse=True)
+
 
 def focal_plane_map(tracker: TrackerStarsOfPeriod) -> FocalPlaneMap | None:
     """Map of a tracker's residuals; None if no star has a residual."""
@@ -73,7 +98,7 @@ def focal_plane_map(tracker: TrackerStarsOfPeriod) -> FocalPlaneMap | None:
     cell = number[:, 1] * CELLS + number[:, 0]
     found = [_of_cell(residual[cell == k], expected[cell == k]) for k in np.unique(cell)]
     lengths = [math.hypot(*mean) for count, mean, *_ in found if count >= LEAST_STARS]
-    longest = max(lengths, default=0.0)
+    longest = longest_drawn(lengths)
     px_per_arcsec = LONGEST * SIZE / CELLS / longest if longest else 0.0
     cells = [
         _drawn(int(k), each, radius_deg, px_per_arcsec)
@@ -115,7 +140,7 @@ def _drawn(number: int, found: _Found, radius_deg: float, px_per_arcsec: float) 
     stars, mean, spread, is_clear = found
     side, step_deg = SIZE / CELLS, 2.0 * radius_deg / CELLS
     x, y = (column + 0.5) * side, SIZE - (row + 0.5) * side
-    along, down = mean[0] * px_per_arcsec, -mean[1] * px_per_arcsec
+    along, down, is_cut = cut(mean[0] * px_per_arcsec, -mean[1] * px_per_arcsec, LONGEST * side)
     return Cell(
         h_deg=(column + 0.5) * step_deg - radius_deg,
         v_deg=(row + 0.5) * step_deg - radius_deg,
@@ -127,6 +152,7 @@ def _drawn(number: int, found: _Found, radius_deg: float, px_per_arcsec: float) 
         y=y,
         shade=sum(spread >= step for step in STEPS),
         arrow=arrow(x - along / 2, y - down / 2, along, down) if stars >= LEAST_STARS else "",
+        is_cut=is_cut and stars >= LEAST_STARS,
     )
 
 

@@ -41,6 +41,8 @@ class Histogram:
     count: int
     below: int
     above: int
+    farthest: float
+    """Residual over sigma that is farthest from zero."""
     median: float
     robust_spread: float
     """Sigma of a normal distribution with the same median absolute deviation."""
@@ -84,6 +86,7 @@ def residual_histogram(tracker: TrackerStarsOfPeriod) -> Histogram | None:
         count=len(values),
         below=int(np.sum(values < -REACH)),
         above=int(np.sum(values > REACH)),
+        farthest=float(values[np.argmax(np.abs(values))]),
         median=float(np.median(values)),
         robust_spread=robust_spread(values),
         mean=float(values.mean()),
@@ -103,6 +106,8 @@ def _phi(value: float) -> float:
 SIZE = 300.0
 LEFT, PLANE_FOOT = 28.0, 24.0
 CELLS = 40
+MOST_SPREADS, LEAST_SPREAD_MAG = 8.0, 0.1
+"""Offsets of magnitude in robust spreads beyond which the axes do not reach for a star."""
 SHADES = (1, 2, 4, 8, 16)
 """Numbers of stars at which a cell gets the next shade."""
 
@@ -122,6 +127,10 @@ class MagnitudeChart:
     """Chart of observed against catalog magnitude; `shades` are paths, from few stars to many."""
 
     shades: tuple[str, ...]
+    beyond: str
+    """SVG path with a triangle at the edge for each star observed beyond it."""
+    beyond_mag: tuple[float, ...]
+    """Observed magnitudes beyond the edges, the faintest first."""
     equal: str
     ticks: tuple[tuple[float, float, str], ...]
     rows: tuple[MagnitudeRow, ...]
@@ -142,9 +151,15 @@ def magnitude_chart(tracker: TrackerStarsOfPeriod) -> MagnitudeChart | None:
     observed, catalog = tracker.observed_mag[known], tracker.catalog_mag[known]
     if not len(observed):
         return None
-    both = np.concatenate([observed, catalog])
+    offset = observed - catalog
+    usual = np.median(offset) + MOST_SPREADS * max(
+        robust_spread(offset), LEAST_SPREAD_MAG
+    ) * np.array([-1, 1])
+    inside = observed[(offset >= usual[0]) & (offset <= usual[1])]
+    both = np.concatenate([inside, catalog])
     low, high = float(np.floor(both.min() * 2) / 2), float(np.ceil(both.max() * 2) / 2)
     high = max(high, low + 1.0)
+    is_beyond = (observed < low) | (observed > high)
     side = SIZE / CELLS
 
     def place(mag: Vector | float) -> Vector:
@@ -154,7 +169,7 @@ def magnitude_chart(tracker: TrackerStarsOfPeriod) -> MagnitudeChart | None:
     column = np.clip(place(catalog) // side, 0, CELLS - 1).astype(int)
     row = np.clip(place(observed) // side, 0, CELLS - 1).astype(int)
     counts = np.zeros((CELLS, CELLS), dtype=int)
-    np.add.at(counts, (row, column), 1)
+    np.add.at(counts, (row[~is_beyond], column[~is_beyond]), 1)
     shades = [
         "".join(
             f"M{LEFT + j * side:g} {6 + SIZE - (i + 1) * side:g}h{side:g}v{side:g}h{-side:g}z"
@@ -163,9 +178,15 @@ def magnitude_chart(tracker: TrackerStarsOfPeriod) -> MagnitudeChart | None:
         for least, most in zip(SHADES, (*SHADES[1:], np.inf), strict=True)
     ]
     marks = [float(each) for each in np.arange(np.ceil(low), high + 0.01) if high - low <= 12]
-    offset = observed - catalog
     return MagnitudeChart(
         shades=tuple(shades),
+        beyond="".join(
+            f"M{LEFT + float(place(mag)):.0f} " + ("6l4 8h-8z" if up else f"{6 + SIZE:g}l4 -8h-8z")
+            for mag, up in zip(
+                catalog[is_beyond].tolist(), (observed[is_beyond] > high).tolist(), strict=True
+            )
+        ),
+        beyond_mag=tuple(np.sort(observed[is_beyond])[::-1].tolist()),
         equal=f"M{LEFT} {6 + SIZE}L{LEFT + SIZE} 6",
         ticks=tuple(
             (

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from service.storage.queries.star_field import Boresight, ObservedStarPlace, TrackerField
+from service.web.console.charts.focal_plane import cut, longest_drawn, round_below
 
 SIZE = 640
 """Width and height of the picture, in pixels."""
 LONGEST_ARROW = 70.0
 """Length of the longest residual arrow, in pixels."""
-ROUND = (1.0, 2.0, 5.0)
 MARK_RADIUS = 13.0
 """Radius of the mark about an observed star; a triangle's corners reach slightly farther."""
 
@@ -188,6 +188,7 @@ class ChartLine:
     y1: float
     x2: float
     y2: float
+    is_cut: bool = False
 
 
 @dataclass(frozen=True)
@@ -202,6 +203,9 @@ class ObservedStar:
     y: float
     arrow: ChartLine | None
     head: str
+    residual_arcsec: float | None
+    is_cut: bool
+    """True if the residual is longer than its arrow."""
     rivals: tuple[ChartLine, ...]
     label: Label
 
@@ -231,7 +235,7 @@ class SkyChart:
     catalog: tuple[CatalogStar, ...]
     observed: tuple[ObservedStar, ...]
     names: tuple[Label, ...]
-    key_arcsec: float | None
+    key_arcsec: float
     key_px: float
     magnitudes: tuple[tuple[int, float], ...]
     through: str
@@ -271,7 +275,8 @@ def sky_chart(tracker: TrackerField, through: str, view: str = "all") -> SkyChar
     named = [star for star in catalog if star.role != "none"]
     places = [projection.place(each.h_deg, each.v_deg) for each in tracker.observed]
     residuals = [each.residual_arcsec for each in tracker.observed]
-    px_per_arcsec, key_arcsec = _arrow_scale([math.hypot(*each) for each in residuals if each])
+    longest = longest_drawn([math.hypot(*each) for each in residuals if each])
+    px_per_arcsec, key_arcsec = (LONGEST_ARROW / longest if longest else 0.0), round_below(longest)
     arrows = [
         _arrow(place, residual, px_per_arcsec)
         for place, residual in zip(places, residuals, strict=True)
@@ -307,7 +312,7 @@ def sky_chart(tracker: TrackerField, through: str, view: str = "all") -> SkyChar
         observed=observed,
         names=tuple(each for each in names if each is not None),
         key_arcsec=key_arcsec,
-        key_px=0.0 if key_arcsec is None else key_arcsec * px_per_arcsec,
+        key_px=key_arcsec * px_per_arcsec,
         magnitudes=tuple((step, star_radius(step, limit_mag)) for step in steps)[-6:],
         through=through,
     )
@@ -346,6 +351,8 @@ def _observed_stars(
             y,
             arrow,
             "" if arrow is None else _head(arrow),
+            math.hypot(*each.residual_arcsec) if each.residual_arcsec else None,
+            arrow is not None and arrow.is_cut,
             tuple(ChartLine(x, y, *at[name]) for name in each.rivals if name in at),
             labels.number(str(number), (x, y)),
         )
@@ -361,22 +368,13 @@ def _arrow(
     if not residual_arcsec or not px_per_arcsec:
         return None
     (x, y), (along_h, along_v) = place, residual_arcsec
-    return ChartLine(x, y, x + along_h * px_per_arcsec, y - along_v * px_per_arcsec)
+    along, down, is_cut = cut(along_h * px_per_arcsec, -along_v * px_per_arcsec, LONGEST_ARROW)
+    return ChartLine(x, y, x + along, y + down, is_cut)
 
 
 def star_radius(magnitude_mag: float, limit_mag: float) -> float:
     """Radius of a star's disc in pixels: 0.9 px more per magnitude; the faintest stay visible."""
     return min(9.0, 1.3 + 0.9 * max(0.0, limit_mag - magnitude_mag))
-
-
-def _arrow_scale(lengths_arcsec: Sequence[float]) -> tuple[float, float | None]:
-    """Pixels per arcsecond, and a round length for the key, at most the longest residual."""
-    longest = max(lengths_arcsec, default=0.0)
-    if longest <= 0.0:
-        return 0.0, None
-    power = 10.0 ** math.floor(math.log10(longest))
-    key = max((factor * power for factor in ROUND if factor * power <= longest), default=power)
-    return LONGEST_ARROW / longest, key
 
 
 def _rings(radius_deg: float, field_deg: float) -> list[float]:

@@ -8,7 +8,7 @@ const TONES = ["--other-1", "--other-2", "--other-3", "--other-4"];
 const LABEL_PX = 16;
 // So wide are the axes of neighbouring charts, so that their times stand below each other.
 const LEAST_AXIS_PX = 58;
-// Beyond so many times what nearly all values lie within, a value is marked at the edge.
+// Beyond so many times what lasts, a value is marked at the edge.
 const OUTLIER = 3;
 const NEARLY_ALL = 0.98;
 
@@ -32,6 +32,15 @@ function tickLabels(_, splits, __, ___, step) {
     const shown = day === before ? label : `${label}\n${day}`;
     before = day;
     return shown;
+  });
+}
+
+// Medians of five neighbours: they leave out what is alone, and keep a step.
+function lasting(values) {
+  const known = values.filter((value) => value !== null && value !== undefined).map(Math.abs);
+  return known.map((_, k) => {
+    const near = known.slice(Math.max(0, k - 2), k + 3).sort((a, b) => a - b);
+    return near[(near.length - 1) >> 1];
   });
 }
 
@@ -322,16 +331,20 @@ export class Trend {
   }
 
   // Means, least and greatest values of what is not hidden.
-  shownValues() {
+  shownColumns() {
     const columns = this.known.flatMap(({ name }, k) => (this.hidden.has(name) ? [] : [1, 2, 3].map((part) => this.data[3 * k + part])));
-    return [...columns, ...this.data.slice(3 * this.known.length + 1)].flat().filter((value) => value !== null && value !== undefined);
+    return [...columns, ...this.data.slice(3 * this.known.length + 1)];
+  }
+
+  shownValues() {
+    return this.shownColumns().flat().filter((value) => value !== null && value !== undefined);
   }
 
   // Zero belongs to the picture of what cannot be negative; limits near the data are shown too.
   // A few values far beyond all others do not flatten these: they are marked at the edge.
   range(low, high, lines) {
     if (low === null) return [0, 1];
-    if (this.vertical !== "all") [low, high] = this.withoutOutliers(low, high);
+    if (this.vertical !== "all" && !this.definition.percent) [low, high] = this.withoutOutliers(low, high);
     const near = lines.map(({ value }) => value).filter((value) => Math.abs(value) <= Math.max(Math.abs(high), Math.abs(low)) * 3 || this.definition.percent);
     let [least, most] = [Math.min(low, ...near), Math.max(high, ...near)];
     if (least >= 0) least = 0;
@@ -340,7 +353,7 @@ export class Trend {
   }
 
   withoutOutliers(low, high) {
-    const sizes = this.shownValues().map(Math.abs).sort((a, b) => a - b);
+    const sizes = this.shownColumns().flatMap(lasting).sort((a, b) => a - b);
     const usual = sizes[Math.floor(NEARLY_ALL * (sizes.length - 1))] ?? 0;
     const edge = OUTLIER * usual;
     return usual > 0 ? [Math.max(low, -edge), Math.min(high, edge)] : [low, high];
@@ -375,12 +388,16 @@ export class Trend {
       return `${label}: greatest ${this.text(greatest)} at ${utc(at)} UTC`;
     });
     const { min: least, max: most } = chart.scales.y;
-    const beyond = this.data[0].filter((_, index) => this.known.some((__, k) => this.data[3 * k + 3][index] > most || (this.data[3 * k + 2][index] !== null && this.data[3 * k + 2][index] < least))).length;
-    this.legend = beyond ? `▲ at the edge: ${beyond} beyond it` : "\u00a0";
+    const outside = (value) => value !== null && (value > most || value < least);
+    const extremes = (index) => this.known.flatMap((_, k) => [this.data[3 * k + 3][index], this.data[3 * k + 2][index]].filter(outside));
+    const beyond = this.data[0].map((_, index) => extremes(index)).filter((found) => found.length);
+    const farthest = beyond.flat().reduce((a, b) => (Math.abs(b) > Math.abs(a) ? b : a), 0);
+    const words = `${beyond.length} beyond the edge, the farthest ${this.text(farthest)}`;
+    this.legend = beyond.length ? `▲ ${words}` : "\u00a0";
     this.readout.textContent = this.legend;
     this.drawKeys();
     const marked = this.annotations.length ? `; ${this.definition.marks ?? "annotations"}: ${this.annotations.length}, listed below` : "";
-    this.holder.setAttribute("aria-label", `${this.definition.title}. ${values.join("; ")}${marked}${beyond ? `; ${beyond} beyond the edge` : ""}`);
+    this.holder.setAttribute("aria-label", `${this.definition.title}. ${values.join("; ")}${marked}${beyond.length ? `; ${words}` : ""}`);
   }
 
   // A button for each line of several, which hides it and shows it; names of several spacecraft.
