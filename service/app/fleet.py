@@ -59,26 +59,42 @@ class Spacecraft:
         with self._context.reading() as connection:
             return self._context.active_alarms(connection, run)
 
-    def states(self, run: str | None = None) -> list[records.SpacecraftRow]:
-        """State of every spacecraft in a run, retired ones included."""
-        moment = utc_now()
+    def states(
+        self, run: str | None = None, spacecraft: Collection[str] | None = None
+    ) -> list[records.SpacecraftRow]:
+        """State of all spacecraft in a run, retired ones included, or of some alone."""
+        known = self._context.known.values()
+        missions = [each for each in known if spacecraft is None or each.name in spacecraft]
         with self._context.reading() as connection:
-            return [
-                histories.live_state(connection, mission, run or LIVE, moment)
-                for mission in self._context.known.values()
-            ]
+            return self._states(connection, missions, run or LIVE, spacecraft)
 
-    def state(self, name: str, run: str | None = None) -> records.SpacecraftState:
+    def state(
+        self, name: str, run: str | None = None, spacecraft: Collection[str] | None = None
+    ) -> records.SpacecraftState:
         """State of one spacecraft in a run, its mission's settings and their history."""
         mission = self._context.mission(name)
         with self._context.reading() as connection:
-            state = histories.live_state(connection, mission, run or LIVE, utc_now())
+            (state,) = self._states(connection, [mission], run or LIVE, spacecraft)
             settings = mission.model_dump(mode="json")
             return records.SpacecraftState(
                 **structs.asdict(state),
                 mission=records.MissionNow(digest=mission.digest, settings=settings),
                 history=histories.mission_history(connection, name),
             )
+
+    def _states(
+        self,
+        connection: Connection,
+        missions: Sequence[Mission],
+        run: str,
+        spacecraft: Collection[str] | None,
+    ) -> list[records.SpacecraftRow]:
+        now, active = utc_now(), self._context.active_alarms(connection, run)
+        _, rows = fleet.fleet_rows(connection, missions, run, now, active, spacecraft)
+        return [
+            histories.live_state(connection, mission, run, now, row.faults)
+            for mission, row in zip(missions, rows, strict=True)
+        ]
 
     def attitudes(self, name: str, **asked: Unpack[PageOfPeriod]) -> Page[records.AttitudeRow]:
         """Page of a spacecraft's attitudes from current results, oldest batch time first."""

@@ -54,14 +54,31 @@ class AttitudeRow(Record, frozen=True, kw_only=True):
 AttitudePage = page_record("AttitudePage", AttitudeRow, "A page of attitudes.")
 
 
+AttitudeState = Literal["good", "suspect", "no_attitude", "no_batches"]
+FaultPart = Literal["attitude", "tracker", "alarms", "freshness"]
+FaultState = Literal["no_attitude", "critical", "silent", "behind", "suspect", "warning", "watch"]
+
+
+class StateFault(Record, frozen=True, kw_only=True):
+    """Fault of a spacecraft: what is wrong with its attitude, a tracker, alarms or freshness."""
+
+    part: FaultPart
+    state: FaultState
+    words: Annotated[str, doc("The fault in words, such as `critical alarm`.")]
+    age_s: float | None
+    """Of `silent`, the time since a batch was received; of `behind`, that behind the run."""
+
+
 class SpacecraftRow(Record, frozen=True, kw_only=True):
     """The state of a spacecraft in a run."""
 
     name: str
     description: str
     retired: Annotated[bool, doc("True if no mission file describes it any more.")]
-    state: Literal["good", "suspect", "no_attitude", "no_batches"]
-    """Status of the latest batch's attitude, `no_attitude`, or `no_batches`."""
+    state: AttitudeState
+    """Status of the latest batch's attitude, `no_attitude`, or `no_batches`; for the state of the
+        spacecraft see `faults`."""
+    faults: Annotated[list[StateFault], doc("What is wrong now, the worst first; empty: nothing.")]
     latest_batch: Summary | None
     attitude: AttitudeRow | None
     """Attitude of the latest batch; null if this batch has none."""

@@ -13,7 +13,7 @@ from service.app.factory import open_app
 from service.contract.spacecraft import WindowCounts
 from service.features.definitive.part import Definitive
 from service.observations.telemetry import read_lines
-from service.storage.queries.fleet import DayCounts, FleetRow, TrackerCounts
+from service.storage.queries.fleet_rows import DayCounts, FleetRow, TrackerCounts
 from service.storage.queries.results import answer_from_json
 from service.times import parse_utc, shifted
 from service.trends import quantities
@@ -21,7 +21,6 @@ from service.web.app import create_app
 from service.web.console import formatting
 from service.web.console.formatting import arcsec
 from service.web.console.pages.batch import adoption
-from service.web.console.pages.overview import OverviewLine
 from tests.waiting import wait_until
 from tests.web import fleet
 from tests.web.console_pages import console_addresses
@@ -29,9 +28,13 @@ from tests.web.markup import Markup
 from tests.web.serving import Server, in_process_settings
 
 
+def text_of_part(html):
+    return re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", html))
+
+
 def text_of(answer):
     Markup(answer.raise_for_status().text)
-    return re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", answer.text))
+    return text_of_part(answer.text)
 
 
 @pytest.fixture(scope="module")
@@ -73,8 +76,7 @@ def test_comparing_runs_waits_until_a_second_run_is_chosen(client, full_run):
 def cell_of(page, name, column):
     """The text of a column of a spacecraft's row in the overview."""
     row = re.search(rf'<tr[^>]*>(?:(?!</tr>).)*/{name}"(?:(?!</tr>).)*</tr>', page, re.DOTALL)
-    cell = re.search(rf'class="c-{column}">(.*?)</td>', row[0], re.DOTALL)[1]
-    return re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", cell)).strip()
+    return text_of_part(re.search(rf'class="c-{column}">(.*?)</td>', row[0], re.DOTALL)[1]).strip()
 
 
 # ---- alarms --------------------------------------------------------------------------------------
@@ -221,10 +223,45 @@ def test_a_state_names_the_worst_of_attitude_tracker_alarms_and_freshness():
             ["silent", "B 0 of 5", "suspect in 59 of 60 of the last hour"],
         ),
     ):
-        line = OverviewLine(replace(row, **changed), 0, None)
-        assert [each.words for each in line.faults] == words
-        assert line.in_trouble is bool(words)
-        assert (line.state == "good") is not bool(words)
+        assert [each.words for each in replace(row, **changed).faults] == words
+
+
+def test_overview_page_title_and_api_agree_on_the_state_of_a_spacecraft(small_fleet):
+    """A good latest batch beside an open critical alarm is no good spacecraft."""
+    app, client = small_fleet
+    good = next(each for each in fleet.names(8) if each not in fleet.troubled(8))
+    fleet.put_alarm(app, good, [("raised", 23.0)], severity="critical", current_severity="critical")
+    rows = client.get("/api/v1/overview").json()["items"]
+    listed = client.get("/api/v1/spacecraft").json()["items"]
+    overview = client.get("/").text
+    words = {}
+    for row, state in zip(rows, listed, strict=True):
+        name = row["name"]
+        own = client.get(f"/api/v1/spacecraft/{name}").json()
+        each = [[fault["words"] for fault in of["faults"]] for of in (row, state, own)]
+        assert each[0] == each[1] == each[2]
+        words[name] = each[0] or [row["state"].replace("_", " ")]
+        page = client.get(f"/spacecraft/{name}")
+        assert re.search(rf"<title>◆ \(\d+\) {name}: {words[name][0]} · ", page.text)
+        if row["latest_batch"]:
+            assert words[name][0] in cell_of(overview, name, "worst")
+    assert words[good] == ["critical alarm"]
+    shown = text_of(client.get(f"/spacecraft/{good}"))
+    assert "● good" not in shown[: shown.index("Latest batch")]
+
+
+def test_the_alarm_of_the_shown_tracker_comes_first_and_says_how_many_more(small_fleet):
+    app, client = small_fleet
+    name = fleet.names(8)[-1]
+    for tracker, severity in (("STARTRACKER_1", "warning"), ("STARTRACKER_2", "critical")):
+        of = {"quantity": "suspect_share", "severity": severity, "current_severity": severity}
+        fleet.put_alarm(app, name, [("raised", 20.0)], tracker=tracker, **of)
+    for asked, first in (({}, "critical"), ({"tracker": "STARTRACKER_1"}, "warning")):
+        page = client.get(f"/spacecraft/{name}", params=asked).text
+        state = text_of_part(re.search(r'<p id="state".*?</p>', page, re.DOTALL)[0])
+        tracker = asked.get("tracker", "STARTRACKER_2")
+        assert re.search(rf"{first} batches with a suspect attitude, {tracker} \+\d more", state)
+        assert "critical" in state
 
 
 def test_a_rate_says_how_far_it_is_from_yesterdays_and_on_how_many_stars():

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 from typing import Any, Literal
 
@@ -17,6 +17,7 @@ from service.intervals import share_of_sums
 from service.missions.mission import Mission
 from service.observations.schema import LIVE
 from service.storage.queries import time_buckets
+from service.storage.queries.fleet_rows import DayCounts, FleetRow, KnownAttitude, TrackerCounts
 from service.storage.queries.histories import live_state
 from service.storage.queries.pages import newest_first
 from service.storage.queries.results import summary_of, summary_query
@@ -50,85 +51,6 @@ MOST_SUMMED = 20_000
 _TICK_S = 1e-6
 _Sums = Sequence[tuple[Any, ...]]
 """Database rows of counts: spacecraft, POSIX time at the start of a cell, and the counts."""
-
-
-@dataclass(frozen=True)
-class TrackerCounts:
-    """Number of stars of a tracker in the latest batch, and number of unique ones."""
-
-    tracker: str
-    observed: int
-    unique: int
-
-
-@dataclass(frozen=True)
-class KnownAttitude:
-    """Newest attitude of a spacecraft: id of its result, time and accuracy."""
-
-    id: str
-    time: str
-    status: str
-    sigma_arcsec: tuple[float, float, float]
-    """One standard deviation about each body axis, in arcsec."""
-
-
-@dataclass(frozen=True)
-class DayCounts:
-    """Counts of observed and ambiguous stars in the last day of a run, and in the day before."""
-
-    observed: int = 0
-    ambiguous: int = 0
-    observed_before: int = 0
-    ambiguous_before: int = 0
-    is_certain: bool = field(default=False, compare=False, kw_only=True)
-    """True if the shares differ by more than chance, where each hour is one trial."""
-
-    @property
-    def points(self) -> float | None:
-        """Rise of the ambiguous share of stars in percentage points; None if a day has no star."""
-        if not self.observed or not self.observed_before:
-            return None
-        before = self.ambiguous_before / self.observed_before
-        return 100.0 * (self.ambiguous / self.observed - before)
-
-
-@dataclass(frozen=True)
-class FleetRow:
-    """State of one spacecraft in a run; without a batch it has no times, attitude or counts."""
-
-    name: str
-    description: str
-    retired: bool
-    """True if no mission file describes the spacecraft any more."""
-    state: str
-    """State from the latest batch: `good`, `suspect`, `no_attitude` or `no_batches`."""
-    alarms: tuple[Alarm, ...]
-    """Alarms that are not cleared, the one with the worst present severity first."""
-    latest_batch: Summary | None = None
-    last_attitude: KnownAttitude | None = None
-    """Newest attitude of the spacecraft, which can be older than the latest batch."""
-    trackers: tuple[TrackerCounts, ...] = ()
-    age_s: float | None = None
-    """Seconds from the spacecraft's latest batch to the run's latest batch."""
-    received_age_s: float | None = None
-    """Seconds since the service received the spacecraft's latest batch."""
-    last_hour: WindowCounts | None = None
-    days: DayCounts = DayCounts()
-
-    @property
-    def alarms_now(self) -> list[Alarm]:
-        """Alarms whose quantity is out of its limits, without shelved ones."""
-        return [each for each in self.alarms if not each.in_limits and each.state != "shelved"]
-
-    @property
-    def alarms_returned(self) -> list[Alarm]:
-        """Alarms whose quantity is back in its limits and that wait to be acknowledged."""
-        return [each for each in self.alarms if each.in_limits and each.state != "shelved"]
-
-    @property
-    def has_attitude(self) -> bool:
-        """True if the latest batch has an attitude of its own."""
-        return self.state in ("good", "suspect")
 
 
 @dataclass(frozen=True)
@@ -174,15 +96,26 @@ def fleet(
     these count.
     """
     named = {mission.name: mission for mission in missions}
-    as_of = latest_time_of(connection, run, spacecraft, now=now)
     active = [each for each in active if each.spacecraft in named]
-    if as_of is None:
-        rows = tuple(_row(each, None, now, active) for each in named.values())
-        return Fleet(run, None, summary(active), rows, None)
-    facts = _Facts(connection, list(named), run, as_of, now)
-    rows = tuple(_row(each, facts, now, active) for each in named.values())
-    cells = _cells(connection, list(named), run, as_of, period)
+    as_of, rows = fleet_rows(connection, named.values(), run, now, active, spacecraft)
+    cells = None if as_of is None else _cells(connection, list(named), run, as_of, period)
     return Fleet(run, as_of, summary(active), rows, cells)
+
+
+def fleet_rows(
+    connection: Connection,
+    missions: Iterable[Mission],
+    run: str,
+    now: Utc,
+    active: Sequence[Alarm],
+    spacecraft: Collection[str] | None = None,
+) -> tuple[Utc | None, tuple[FleetRow, ...]]:
+    """Read the time of a run's newest batch, and the state of every mission; see `fleet`."""
+    found = list(missions)
+    as_of = latest_time_of(connection, run, spacecraft, now=now)
+    names = [each.name for each in found]
+    facts = None if as_of is None else _Facts(connection, names, run, as_of, now)
+    return as_of, tuple(_row(each, facts, run, now, active) for each in found)
 
 
 def present_rank(alarm: Alarm) -> tuple[bool, int]:
@@ -219,7 +152,9 @@ class _Facts:
         self.days = _days(connection, names, run, as_of)
 
 
-def _row(mission: Mission, facts: _Facts | None, now: Utc, active: Sequence[Alarm]) -> FleetRow:
+def _row(
+    mission: Mission, facts: _Facts | None, run: str, now: Utc, active: Sequence[Alarm]
+) -> FleetRow:
     name = mission.name
     batch = None if facts is None else facts.latest.get(name)
     about = name, mission.description, mission.retired
@@ -237,6 +172,7 @@ def _row(mission: Mission, facts: _Facts | None, now: Utc, active: Sequence[Alar
         received_age_s=(now.tai_ns - recorded_utc(batch.received).tai_ns) * 1e-9,
         last_hour=facts.last_hour.get(name),
         days=facts.days.get(name, DayCounts()),
+        is_live=run == LIVE,
     )
 
 
@@ -480,16 +416,20 @@ def overview(
     """
     if spacecraft is not None:
         missions = [each for each in missions if each.name in spacecraft]
-    as_of = latest_time_of(connection, run, spacecraft, now=now)
     if spacecraft is not None:
         active = [each for each in active if each.spacecraft in spacecraft]
+    missions = list(missions)
+    as_of, rows = fleet_rows(connection, missions, run, now, active, spacecraft)
     return Overview(
         run=run,
         default_run=default_run(connection, spacecraft),
         as_of=None if as_of is None else as_of.text,
         now=now.text,
         alarms=summary(active),
-        items=[_item(connection, each, run, as_of, now, active) for each in missions],
+        items=[
+            _item(connection, each, row, run, as_of, now)
+            for each, row in zip(missions, rows, strict=True)
+        ],
     )
 
 
@@ -510,24 +450,22 @@ def default_run(connection: Connection, spacecraft: Collection[str] | None = Non
 def _item(
     connection: Connection,
     mission: Mission,
+    row: FleetRow,
     run: str,
     as_of: Utc | None,
     now: Utc,
-    active: Sequence[Alarm],
 ) -> OverviewRow:
-    state = live_state(connection, mission, run, now)
+    state = live_state(connection, mission, run, now, row.faults)
     batch, attitude = state.latest_batch, state.last_attitude
     item: Row = structs.asdict(state) | {
         "sigma_arcsec": attitude and sigma_arcsec(attitude.covariance_arcsec2),
-        "age_s": None,
-        "received_age_s": None,
+        "age_s": row.age_s,
+        "received_age_s": row.received_age_s,
         **dict.fromkeys(("last_hour", "last_day", "sparkline_hour", "sparkline_day")),
-        "alarms": [alarm for alarm in active if alarm.spacecraft == mission.name],
+        "alarms": row.alarms,
     }
     if batch is None or as_of is None:
         return OverviewRow(**item)
-    item["age_s"] = max(0.0, (as_of.tai_ns - recorded_utc(batch.time).tai_ns) * 1e-9)
-    item["received_age_s"] = (now.tai_ns - recorded_utc(batch.received).tai_ns) * 1e-9
     for name, width_s in (("hour", HOUR_S), ("day", DAY_S)):
         # The window includes the latest batch, and excludes one exactly its length before.
         end = shifted(as_of, _TICK_S)

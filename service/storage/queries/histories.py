@@ -2,7 +2,7 @@
 
 import json
 import logging
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
 from typing import Any, ClassVar
@@ -13,7 +13,7 @@ from sqlalchemy import Connection, Select, exists, func, select
 from service.acquire.result import METHOD
 from service.contract.base import Page
 from service.contract.runs import Run
-from service.contract.spacecraft import AttitudeRow, MissionThen, SpacecraftRow
+from service.contract.spacecraft import AttitudeRow, MissionThen, SpacecraftRow, StateFault
 from service.missions.mission import Mission
 from service.observations.schema import LIVE
 from service.storage.archive.reading import Archive
@@ -66,11 +66,14 @@ def list_attitudes(
     return listing.page(connection, limit, cursor, attitude_row)
 
 
-def live_state(connection: Connection, mission: Mission, run: str, now: Utc) -> SpacecraftRow:
-    """State of a spacecraft in a run: its newest batch and its newest attitude.
+def live_state(
+    connection: Connection, mission: Mission, run: str, now: Utc, faults: Sequence[StateFault]
+) -> SpacecraftRow:
+    """State of a spacecraft in a run: its newest batch, its newest attitude, and its faults.
 
     `state` is that of the newest batch: good, suspect, no_attitude, or no_batches.  `attitude` is
-    that batch's own, or None; `last_attitude` is the newest of any batch.
+    that batch's own, or None; `last_attitude` is the newest of any batch.  `faults` are those of
+    the spacecraft's row in the fleet.
     """
     selected = pages.ResultFilter(run, mission.name)
     batch = pages.newest(connection, summary_query(), selected, now)
@@ -91,6 +94,7 @@ def live_state(connection: Connection, mission: Mission, run: str, now: Utc) -> 
         attitude=last if is_latest else None,
         last_attitude=last,
         tracking=tracking,
+        faults=list(faults),
     )
 
 

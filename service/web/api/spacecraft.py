@@ -39,8 +39,7 @@ router = ApiRouter("spacecraft")
 )
 def list_spacecraft(query: FromQuery[params.RunQuery], app: AppDep, caller: CallerDep) -> Response:
     """Every spacecraft with a mission file, with its state in a run."""
-    theirs = [each for each in app.spacecraft.states(query.run) if caller.may_see(each.name)]
-    return json_response({"items": theirs})
+    return json_response({"items": app.spacecraft.states(query.run, caller.spacecraft)})
 
 
 @ClientMethod("spacecraft")
@@ -52,10 +51,10 @@ def list_spacecraft(query: FromQuery[params.RunQuery], app: AppDep, caller: Call
     Returns("The spacecraft.", models.SpacecraftState),
 )
 def get_spacecraft(
-    name: SpacecraftPath, query: FromQuery[params.RunQuery], app: AppDep
+    name: SpacecraftPath, query: FromQuery[params.RunQuery], app: AppDep, caller: CallerDep
 ) -> Response:
     """One spacecraft: state in a run, mission settings and their history."""
-    return json_response(app.spacecraft.state(name, query.run))
+    return json_response(app.spacecraft.state(name, query.run, caller.spacecraft))
 
 
 @ClientMethod(

@@ -31,7 +31,7 @@ from service.feature import feature_folders, feature_modules
 from service.observations.schema import LIVE
 from service.times import Utc, parse_utc
 from service.trends.limits import Severity
-from service.web.console.formatting import FILTERS, completed_utc, present
+from service.web.console.formatting import FILTERS, STATES, completed_utc, present
 from service.web.requests import problems
 from service.web.requests.access import POLICIES, AppDep, CallerDep, Policy
 from service.web.requests.problems import ProblemType, faults_in_query, on_http_error, root_path
@@ -145,6 +145,11 @@ class AlarmCounts:
     shelved: int
     worst: str | None
     """Greatest severity of the alarms that are out of limits and not shelved."""
+
+    @property
+    def mark(self) -> str:
+        """Shape of the worst severity with a space; empty if no alarm is out of limits."""
+        return f"{STATES[self.worst][0]} " if self.worst else ""
 
 
 def alarm_counts(found: Sequence[Alarm]) -> AlarmCounts:

@@ -1,16 +1,14 @@
 """First page: the state of every spacecraft in a row, the worst first."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
 from starlette.responses import Response
 
-from service.observations.schema import LIVE
-from service.storage.queries.fleet import PERIODS_S, Fleet, FleetCells, FleetRow, Period, last_day
+from service.storage.queries.fleet import PERIODS_S, Fleet, FleetCells, Period, last_day
+from service.storage.queries.fleet_rows import MARKED_SHARE, RANKS, FleetRow
 from service.trends.limits import Severity
 from service.trends.measures import BatchShare, StarShare
 from service.trends.quantities import QUANTITIES, OneOf
@@ -19,8 +17,6 @@ from service.web.console import page
 from service.web.console.charts.sparkline import SparklineDrawing, common_top, packed, sparkline
 from service.web.requests.access import Policy
 
-STALE_AFTER_S = 3600.0
-"""Seconds after which a spacecraft counts as silent, or as behind the latest batch of its run."""
 Order = Literal["worst", "name", "behind", "ambiguous", "unmatched", "alarms"]
 Shown = Literal["all", "trouble", "alarm", "stale", "no_attitude", "no_batches"]
 SHOWN: dict[Shown, str] = {
@@ -33,10 +29,6 @@ SHOWN: dict[Shown, str] = {
 }
 UNFOLDED = 20
 """Number of rows that are shown by default."""
-MARKED_SHARE = 0.15
-"""Share of ambiguous or unmatched stars in the last hour: by default the bound of `watch`."""
-_RANKS = {"no_attitude": 5, "critical": 5, "silent": 4, "behind": 4, "suspect": 3, "warning": 2}
-"""Rank of each state by severity; every other fault has the rank 1."""
 SPARK_QUANTITIES = ("ambiguous_share", "unmatched_share")
 
 
@@ -58,82 +50,12 @@ class OverviewQuery(page.SortedQuery):
 
 
 @dataclass(frozen=True)
-class StateFault:
-    """Fault of a spacecraft: a state of `formatting.STATES`, and words."""
-
-    state: str
-    words: str
-
-    @property
-    def rank(self) -> int:
-        """Rank of the fault by severity."""
-        return _RANKS.get(self.state, 1)
-
-
-@dataclass(frozen=True)
 class OverviewLine:
     """Row of one spacecraft; `place` is the index of its cells."""
 
     item: FleetRow
     place: int
     spark: SparklineDrawing | None
-    is_live: bool = True
-
-    @property
-    def is_silent(self) -> bool:
-        """True if the service has received no live batch of the spacecraft for long."""
-        return self.is_live and not self.item.retired and _is_long(self.item.received_age_s)
-
-    @property
-    def is_stale(self) -> bool:
-        """True if the spacecraft is silent or behind the run; never for a retired one."""
-        return self.is_silent or (not self.item.retired and _is_long(self.item.age_s))
-
-    @cached_property
-    def faults(self) -> list[StateFault]:
-        """Faults of the spacecraft in attitude, trackers, alarms and freshness, the worst first."""
-        found = [*self._of_attitude(), *self._of_trackers()]
-        if self.is_stale:
-            state = "silent" if self.is_silent else "behind"
-            found.append(StateFault(state, state))
-        if self.item.alarms_now:
-            word = self.item.alarms_now[0].current_severity or "watch"
-            found.append(StateFault(word, f"{word} alarm"))
-        return sorted(found, key=lambda each: -each.rank)
-
-    def _of_attitude(self) -> Iterator[StateFault]:
-        """Faults of the latest attitude, or otherwise of the attitudes of the last hour."""
-        item, hour = self.item, self.item.last_hour
-        if item.state in ("suspect", "no_attitude"):
-            yield StateFault(item.state, item.state.replace("_", " "))
-            return
-        if hour is None or not hour.batches:
-            return
-        for state, count in (
-            ("no_attitude", hour.batches - hour.solved),
-            ("suspect", hour.suspect),
-        ):
-            if count > MARKED_SHARE * hour.batches:
-                of = f"{count} of {hour.batches} of the last hour"
-                yield StateFault("acquiring", f"{state.replace('_', ' ')} in {of}")
-
-    def _of_trackers(self) -> Iterator[StateFault]:
-        """Trackers that identify none of their stars while others do."""
-        if not self.item.has_attitude or len(self.item.trackers) < 2:
-            return
-        for each in self.item.trackers:
-            if each.observed and not each.unique:
-                yield StateFault("suspect", f"{each.tracker} 0 of {each.observed}")
-
-    @property
-    def state(self) -> str:
-        """Worst fault of the spacecraft; without any the state of its latest batch."""
-        return self.faults[0].state if self.faults else self.item.state
-
-    @property
-    def in_trouble(self) -> bool:
-        """True if the spacecraft needs attention."""
-        return bool(self.faults)
 
     def share(self, outcome: str) -> float:
         """Share of an outcome in the last hour; -1 without observed stars."""
@@ -145,10 +67,6 @@ class OverviewLine:
     def is_marked(self, outcome: str) -> bool:
         """True if the share of an outcome needs attention."""
         return self.share(outcome) > MARKED_SHARE
-
-
-def _is_long(seconds: float | None) -> bool:
-    return seconds is not None and seconds > STALE_AFTER_S
 
 
 @dataclass(frozen=True)
@@ -170,10 +88,7 @@ def overview_page(query: page.FromQuery[OverviewQuery], context: page.ContextDep
     top = common_top(
         max((_greatest(shares[name]) for name in SPARK_QUANTITIES if shares), default=0)
     )
-    every = [
-        replace(_line(fleet, place, shares, top), is_live=query.run == LIVE)
-        for place in range(len(fleet.rows))
-    ]
+    every = [_line(fleet, place, shares, top) for place in range(len(fleet.rows))]
     found = _sorted([line for line in every if _is_shown(line, query)], query)
     sent = [line for line in found if line.item.latest_batch] or found
     lines = found if query.all or query.q or query.show != "all" else sent[:UNFOLDED]
@@ -200,7 +115,7 @@ def overview_page(query: page.FromQuery[OverviewQuery], context: page.ContextDep
 def _words_of(lines: list[OverviewLine]) -> str:
     """Text with the numbers of rows with faults, without faults, and without any batch."""
     silent = [line for line in lines if not line.item.latest_batch]
-    trouble = [line for line in lines if line.in_trouble and line.item.latest_batch]
+    trouble = [line for line in lines if line.item.faults and line.item.latest_batch]
     parts = (
         (len(trouble), "in trouble"),
         (len(lines) - len(trouble) - len(silent), "without trouble"),
@@ -245,13 +160,13 @@ def _is_shown(line: OverviewLine, query: OverviewQuery) -> bool:
         case "all":
             return True
         case "trouble":
-            return line.in_trouble
+            return bool(item.faults)
         case "alarm":
             return any(each.state != "shelved" for each in item.alarms)
         case "stale":
-            return line.is_stale
+            return any(each.part == "freshness" for each in item.faults)
         case state:
-            return state == line.state or state in [each.state for each in line.faults]
+            return state in (item.state, *(each.state for each in item.faults))
 
 
 def _sorted(lines: list[OverviewLine], query: OverviewQuery) -> list[OverviewLine]:
@@ -272,7 +187,7 @@ def _sorted(lines: list[OverviewLine], query: OverviewQuery) -> list[OverviewLin
 
 def _badness(line: OverviewLine) -> tuple[Any, ...]:
     """Sort key: the ranks of the faults from the worst on, then the share of ambiguous stars."""
-    ranks = [each.rank for each in line.faults]
+    ranks = [RANKS[each.state] for each in line.item.faults]
     return ranks, line.share("ambiguous"), line.share("unmatched"), len(line.item.alarms_returned)
 
 

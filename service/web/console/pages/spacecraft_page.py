@@ -8,11 +8,12 @@ from urllib.parse import quote, urlencode
 from pydantic import Field, ValidationInfo, field_validator
 from starlette.responses import Response
 
-from service.contract.alarms import Annotation, Limit
+from service.contract.alarms import Alarm, Annotation, Limit
 from service.contract.answers import Summary
 from service.contract.base import Page
 from service.contract.spacecraft import MissionThen, Ranking
 from service.observations.schema import LIVE, Key
+from service.storage.queries.fleet_rows import out_of_limits
 from service.times import (
     DAY_S,
     HOUR_S,
@@ -153,7 +154,7 @@ class DrawnLimits:
 @console_page("/spacecraft/{name}", "Spacecraft", Policy("read", "path"), section="/")
 def spacecraft_page(name: str, query: FromQuery[SpacecraftQuery], context: ContextDep) -> Response:
     """Page of one spacecraft in a run: trends, and worst batches."""
-    state = context.app.spacecraft.state(name, query.run)
+    state = context.app.spacecraft.state(name, query.run, context.caller.spacecraft)
     latest = context.app.results.page(spacecraft=name, run=query.run, limit=1).items
     stretch = shown_period(context, name, query, latest)
     trackers = context.app.context.trackers(name)
@@ -168,10 +169,9 @@ def spacecraft_page(name: str, query: FromQuery[SpacecraftQuery], context: Conte
         "spacecraft.html.jinja",
         query.run,
         name=name,
-        description=state.description,
-        retired=state.retired,
+        state=state,
+        out_now=_alarms_now(context, name, query),
         latest=latest,
-        tracking=state.tracking,
         stretch=stretch,
         ranges=list(RANGES_S),
         by=ranking.by,
@@ -201,6 +201,13 @@ def spacecraft_page(name: str, query: FromQuery[SpacecraftQuery], context: Conte
             and history_address(name, query.run, query.tracker, stretch.start, stretch.end, **more)
         ),
     )
+
+
+def _alarms_now(context: PageContext, name: str, query: SpacecraftQuery) -> list[Alarm]:
+    """Alarms out of limits and not shelved, the worst first; those of the shown tracker before."""
+    found = out_of_limits(context.app.spacecraft.alarms(query.run))
+    own = [each for each in found if each.spacecraft == name]
+    return sorted(own, key=lambda each: query.tracker not in (None, each.tracker))
 
 
 def shown_period(

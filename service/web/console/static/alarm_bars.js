@@ -5,6 +5,7 @@ import { posix, utc } from "./times.js";
 import { rooted } from "./requests.js";
 
 const SHAPES = { watch: "△", warning: "▲", critical: "◆" };
+const SEVERITIES = Object.keys(SHAPES);
 const MOST_ROWS = 4;
 
 export class AlarmBars {
@@ -18,19 +19,27 @@ export class AlarmBars {
     this.holder.style.width = `${width}px`;
   }
 
-  // A row for each quantity and tracker, with its name above; the page of alarms has those beyond the last row.
+  // A row for each quantity and tracker, with its name above: of the shown tracker, out now and the worst first.
+  // The page of alarms has those beyond the last row.
   show(alarms, start, end) {
     const rows = new Map();
+    const query = new URLSearchParams(location.search);
+    const rank = ({ tracker, severity, end: until }) => 9 * (tracker !== null && tracker === query.get("tracker")) + 3 * (until === null) + SEVERITIES.indexOf(severity);
+    const worst = ([, spans]) => Math.max(...spans.map(rank));
     for (const alarm of alarms) {
       if (!this.labels.has(alarm.quantity)) continue;
       const name = [...(alarm.tracker ? [alarm.tracker] : []), this.labels.get(alarm.quantity)].join(": ");
       rows.set(name, [...(rows.get(name) ?? []), alarm]);
     }
     this.holder.hidden = rows.size === 0;
-    const shown = [...rows].slice(0, MOST_ROWS).map(([name, spans]) => {
+    const shown = [...rows].reverse().sort((a, b) => worst(b) - worst(a)).slice(0, MOST_ROWS).map(([name, spans]) => {
       const track = element("div", { className: "track" }, ...spans.map((each) => this.bar(each, name, start, end)));
       return element("div", {}, element("p", {}, name), track);
     });
+    if (rows.size > MOST_ROWS) {
+      const listed = new URLSearchParams({ run: document.body.dataset.run, spacecraft: document.getElementById("charts").dataset.spacecraft, state: "all" });
+      shown.push(element("p", {}, element("a", { href: rooted(`/alarms?${listed}`) }, `${rows.size - MOST_ROWS} more`)));
+    }
     this.holder.replaceChildren(...shown);
   }
 
