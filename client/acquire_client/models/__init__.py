@@ -96,6 +96,7 @@ from .spacecraft import Rates as Rates
 from .spacecraft import Series as Series
 from .spacecraft import SpacecraftRow as SpacecraftRow
 from .spacecraft import SpacecraftState as SpacecraftState
+from .spacecraft import StateFault as StateFault
 from .tracks import Track as Track
 from .tracks import TrackList as TrackList
 from .tracks import TrackPoint as TrackPoint

@@ -29,6 +29,17 @@ class AttitudeRow(Model, frozen=True, kw_only=True):
     status: Status
 
 
+class StateFault(Model, frozen=True, kw_only=True):
+    """Fault of a spacecraft: what is wrong with its attitude, a tracker, alarms or freshness."""
+
+    part: str
+    state: str
+    words: str
+    """The fault in words, such as `critical alarm`."""
+    age_s: float | None
+    """Of `silent`, the time since a batch was received; of `behind`, that behind the run."""
+
+
 class SpacecraftRow(Model, frozen=True, kw_only=True):
     """The state of a spacecraft in a run."""
 
@@ -37,7 +48,10 @@ class SpacecraftRow(Model, frozen=True, kw_only=True):
     retired: bool
     """True if no mission file describes it any more."""
     state: str
-    """Status of the latest batch's attitude, `no_attitude`, or `no_batches`."""
+    """Status of the latest batch's attitude, `no_attitude`, or `no_batches`; for the state of the
+    spacecraft see `faults`."""
+    faults: Sequence[StateFault]
+    """What is wrong now, the worst first; empty: nothing."""
     latest_batch: Summary | None
     attitude: AttitudeRow | None
     """Attitude of the latest batch; None if this batch has none."""
