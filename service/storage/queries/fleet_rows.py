@@ -126,8 +126,10 @@ class FleetRow:
     def _of_attitude(self) -> Iterator[StateFault]:
         """Faults of the latest attitude, or otherwise of the attitudes of the last hour."""
         hour = self.last_hour
-        if self.state == "suspect" or self.state == "no_attitude":
-            yield _fault("attitude", self.state, self.state.replace("_", " "))
+        if self.state == "suspect":
+            yield _fault("attitude", "suspect", "suspect")
+        elif self.state == "no_attitude":
+            yield _fault("attitude", "no_attitude", "no attitude")
         elif hour is not None:
             for name, count in (
                 ("no attitude", hour.batches - hour.solved),
