@@ -66,7 +66,7 @@ class StateFault(Record, frozen=True, kw_only=True):
     state: FaultState
     words: Annotated[str, doc("The fault in words, such as `critical alarm`.")]
     age_s: float | None
-    """Of `silent`, the time since a batch was received; of `behind`, that behind the run."""
+    """Time since a batch was received (`silent`), or behind the run (`behind`)."""
 
 
 class SpacecraftRow(Record, frozen=True, kw_only=True):
