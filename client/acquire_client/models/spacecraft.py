@@ -37,7 +37,7 @@ class StateFault(Model, frozen=True, kw_only=True):
     words: str
     """The fault in words, such as `critical alarm`."""
     age_s: float | None
-    """Of `silent`, the time since a batch was received; of `behind`, that behind the run."""
+    """Time since a batch was received (`silent`), or behind the run (`behind`)."""
 
 
 class SpacecraftRow(Model, frozen=True, kw_only=True):
