@@ -22,10 +22,12 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from tqdm import tqdm
 
 from benchmarks.bounds import at_least, at_most, equal
 from benchmarks.report import Report
@@ -82,7 +84,10 @@ def run(quick: bool, seed: int) -> Report:
     moments_s = np.random.default_rng(seed).uniform(
         0.0, LATEST_CUT_S, QUICK_CUT_STARTS if quick else CUT_STARTS
     )
-    cut = [_cut_start(float(each), bodies) for each in moments_s]
+    cut = [
+        _cut_start(float(each), bodies)
+        for each in tqdm(moments_s, unit=" cut starts", file=sys.stderr)
+    ]
     waits = np.array([post.wait_ms for post in posts])
     whole_sky = [post for post in posts if "lost_in_space" in post.path]
     figures: dict[str, Any] = {
@@ -196,5 +201,9 @@ def _posted(served: Served, bodies: Sequence[dict[str, Any]]) -> list[Post]:
 
 
 def _processor_ms(served: Served) -> float:
-    tasks = Path(f"/proc/{served.pid}/task").iterdir()
-    return sum(int((task / "schedstat").read_text().split()[0]) for task in tasks) / 1e6
+    spent_ns = 0
+    for task in Path(f"/proc/{served.pid}/task").iterdir():
+        # A thread may end after it was listed.
+        with suppress(FileNotFoundError, ProcessLookupError):
+            spent_ns += int((task / "schedstat").read_text().split()[0])
+    return spent_ns / 1e6
