@@ -62,6 +62,10 @@ class _Share(NamedTuple):
     """True if the child also compiles the kernels of features and of pictures."""
 
 
+def do_nothing() -> None:
+    """Do nothing: the default of a function that child processes receive by its name."""
+
+
 class KernelBuild:
     """Build of the compiled kernels that this machine's cache lacks, with its state."""
 
@@ -103,12 +107,15 @@ class KernelBuild:
         missions: Mapping[str, Mission],
         zones_built: Callable[[], None] = lambda: None,
         whole_sky_built: Callable[[], None] = lambda: None,
+        build_files: Callable[[], None] = do_nothing,
     ) -> None:
         """Compile the missing kernels in two child processes, or in one on a single processor.
 
         Both begin with the kernels for batches with a zone, then those for whole-sky searches.
         `zones_built` and `whole_sky_built` are called when these are ready, while the rest is
-        compiled. Raises `Busy` if a child fails, `Stopping` if cancelled.
+        compiled. A child calls `build_files` between its kernels for the whole sky and
+        `whole_sky_built`: building the files here would hold the interpreter's lock, and batches
+        would wait. Raises `Busy` if a child fails, `Stopping` if cancelled.
         """
         if not self.is_needed:
             return
@@ -120,7 +127,7 @@ class KernelBuild:
                 receiver, sender = _CONTEXT.Pipe(duplex=False)
                 child = _CONTEXT.Process(
                     target=_compile,
-                    args=(dict(missions), share, sender, own_source()),
+                    args=(dict(missions), share, build_files, sender, own_source()),
                     daemon=True,
                 )
                 self._children.append(child)
@@ -238,6 +245,7 @@ def _has_reported(child: connection.Connection) -> bool:
 def _compile(
     missions: Mapping[str, Mission],
     share: _Share,
+    build_files: Callable[[], None],
     compiled: connection.Connection,
     parent: Source,
 ) -> None:
@@ -250,6 +258,7 @@ def _compile(
     compiled.send_bytes(b"zones")
     if share.whole_sky:
         prewarm_kernels(sky, missions, share.whole_sky)
+        build_files()
     compiled.send_bytes(b"whole sky")
     if share.beside_batches:
         compile_beside_batches()

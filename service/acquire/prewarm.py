@@ -4,11 +4,14 @@ import json
 import math
 import os
 from collections.abc import Collection, Iterable, Mapping
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from service.acquire import acquire
+from service.errors import AcquisitionError
 from service.feature import SETTING, feature_modules
 from service.identify.prior_attitude import prior_attitude, search_region
 from service.imaging.frames.jpeg import compile_walk
@@ -17,6 +20,7 @@ from service.missions.mission import Band, Mission
 from service.observations.batch import APriori, BoresightPrior, SunPointedPrior
 from service.observations.schema import submission_from_json
 from service.sky.cache import LruCache
+from service.sky.catalog.star_catalog import open_catalog
 from service.sky.model import SkyModel
 from service.sky.zones import Zone
 from service.times import Utc, parse_utc
@@ -42,6 +46,19 @@ def prewarm_sky(
         if whole_sky:
             for radius_deg in {each.field_of_view_radius_deg for each in mission.trackers}:
                 sky.index(mission, run_catalog, radius_deg)
+
+
+def build_sky_files(catalog: Path | None, epochs: Iterable[tuple[Mission, list[Utc]]]) -> None:
+    """Build the missing files of the whole sky, for missions at their times.
+
+    `catalog` is the catalog's file, None for the embedded one. A mission whose sky cannot be built
+    is left out: the service says so when it opens the files.
+    """
+    sky = SkyModel(open_catalog(catalog), LruCache(1))
+    for mission, times in epochs:
+        with suppress(AcquisitionError):
+            for time in times:
+                prewarm_sky(sky, [mission], time)
 
 
 def prewarm_zones(sky: SkyModel, mission: Mission, prior: APriori, time: Utc) -> list[Zone]:

@@ -5,12 +5,13 @@ import logging
 import threading
 from collections.abc import Collection, Sequence
 from dataclasses import replace
+from functools import partial
 
 from msgspec import structs
 
 from service import __version__
 from service.acquire.kernel_build import KernelBuild, progress_logged
-from service.acquire.prewarm import prewarm_kernels, prewarm_sky
+from service.acquire.prewarm import build_sky_files, prewarm_kernels, prewarm_sky
 from service.app.context import Context
 from service.app.replays import Replays
 from service.app.single_projector import SingleProjector
@@ -19,6 +20,7 @@ from service.contract.spacecraft import About, CatalogAbout, MissionAbout
 from service.errors import AcquisitionError, Busy
 from service.ingest.submit import SubmissionService
 from service.missions.identifiers import IDENTIFIERS
+from service.missions.mission import Mission
 from service.observations.schema import Submission, submission_from_json
 from service.sky.cache import LruCache
 from service.storage.projections.heads import require_head
@@ -97,7 +99,10 @@ class Service:
         if self._kernels is not None and self._kernels.is_needed:
             with progress_logged(log):
                 self._kernels.run(
-                    self._context.missions, self._begin_with_zones, self._go_on_with_whole_sky
+                    self._context.missions,
+                    self._begin_with_zones,
+                    self._go_on_with_whole_sky,
+                    partial(build_sky_files, self._context.settings.catalog, self._epochs()),
                 )
         prewarm_kernels(self._context.sky, self._context.missions)
         self._prewarm_sky()
@@ -118,7 +123,7 @@ class Service:
         log.info("ready for batches with an a priori attitude; still compiling other kernels")
 
     def _go_on_with_whole_sky(self) -> None:
-        """Load the kernels of whole-sky searches, and build their catalogs."""
+        """Load the kernels of whole-sky searches, and open their catalogs."""
         prewarm_kernels(self._context.sky, self._context.missions)
         self._prewarm_sky(whole_sky=True)
         log.info("ready for batches that need the whole sky; still compiling other kernels")
@@ -129,23 +134,30 @@ class Service:
         They are of the present epoch, of the latest batches, and in a server of simulated
         telemetry, so that no such batch waits while a file is built.
         """
-        sky, now = self._context.sky, utc_now()
+        sky = self._context.sky
         # The files of other epochs displace no zones in memory before a batch opens them.
         files = replace(sky, cache=LruCache(1))
-        times: dict[str, list[Utc]] = {name: [] for name in self._context.missions}
-        for sent in self._latest_batches():
-            times[sent.batch.spacecraft].append(sent.batch.time)
         whole_sky |= self._kernels is None or not self._kernels.whole_sky_needed
-        for mission in self._context.missions.values():
-            if self._kernels is not None:
-                times[mission.name].append(parse_utc(mission.simulated_start))
+        for mission, (*times, now) in self._epochs():
             try:
-                for time in times[mission.name]:
+                for time in times:
                     prewarm_sky(files, [mission], time, whole_sky)
                 prewarm_sky(sky, [mission], now, whole_sky)
             except AcquisitionError as error:
                 # Only batches of this mission are refused then; no other mission waits for it.
                 log.warning("the sky of %s cannot be built: %s", mission.name, error)
+
+    def _epochs(self) -> list[tuple[Mission, list[Utc]]]:
+        """The missions with the times for which their catalogs are built, the present one last."""
+        times: dict[str, list[Utc]] = {name: [] for name in self._context.missions}
+        for sent in self._latest_batches():
+            times[sent.batch.spacecraft].append(sent.batch.time)
+        missions = self._context.missions.values()
+        if self._kernels is not None:
+            for mission in missions:
+                times[mission.name].append(parse_utc(mission.simulated_start))
+        now = utc_now()
+        return [(mission, [*times[mission.name], now]) for mission in missions]
 
     def _become_warm(self) -> None:
         if not self._is_warm:

@@ -14,11 +14,13 @@ import pytest
 
 from service.acquire import kernel_build
 from service.acquire.kernel_build import KernelBuild
-from service.acquire.prewarm import prewarm_kernels
+from service.acquire.prewarm import build_sky_files, prewarm_kernels, prewarm_sky
 from service.errors import Busy, Stopping
 from service.missions.identifiers import IDENTIFIERS
+from service.sky import model
 from service.sky.cache import LruCache
 from service.sky.model import SkyModel
+from service.times import parse_utc
 
 
 @pytest.fixture
@@ -124,7 +126,7 @@ def test_what_batches_with_a_zone_need_is_compiled_without_the_whole_sky(
 
 
 SELDOM = """
-from service.acquire.prewarm import prewarm_kernels
+from service.acquire.prewarm import build_sky_files, prewarm_kernels, prewarm_sky
 from service.attitude.kernels import fit_attitude
 from service.identify.attitude_from_matches import _matched_vectors
 from service.identify.hypotheses.groups import _log_weight_of
@@ -149,7 +151,7 @@ def test_what_few_batches_need_is_compiled_before_one_comes():
     assert done.stdout.split() == [b"1"] * 7
 
 
-def _wait_between(missions, share, compiled, parent):
+def _wait_between(missions, share, build_files, compiled, parent):
     """Instead of compiling: a child that goes on, or fails, when files in the folder say so."""
     folder = Path(os.environ["NUMBA_CACHE_DIR"])
     for stage in ("zones", "whole sky", "the rest"):
@@ -161,7 +163,7 @@ def _wait_between(missions, share, compiled, parent):
             compiled.send_bytes(stage.encode())
 
 
-def _fail(missions, share, compiled, parent):
+def _fail(missions, share, build_files, compiled, parent):
     raise SystemExit(1)
 
 
@@ -211,3 +213,14 @@ def test_a_child_that_fails_before_its_zones_opens_nothing(nothing_compiled, mon
     with pytest.raises(Busy, match="could not be compiled"):
         build.run({}, lambda: pytest.fail("zones are not compiled"))
     assert build.zones_needed
+
+
+def test_files_of_the_whole_sky_are_built_apart_and_opened_by_the_service(
+    missions, sky, nothing_compiled, monkeypatch
+):
+    """In the service the building would hold the interpreter's lock, and batches would wait."""
+    xte, now = missions["XTE"], parse_utc("2026-11-30T00:00:00Z")
+    build_sky_files(None, [(xte, [now])])
+    monkeypatch.setattr(model, "build_sky_index", lambda *_: pytest.fail("built again"))
+    monkeypatch.setattr(model, "build_run_catalog", lambda *_: pytest.fail("built again"))
+    prewarm_sky(SkyModel(sky.catalog, LruCache(64 << 20)), [xte], now)
