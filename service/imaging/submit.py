@@ -134,6 +134,8 @@ def submission_of_frame(
     used = [star for star in stars if star.left_out is None]
     doubt = [] if trails else doubt_of_exposure(found, camera, frame.exposure_s, stated)
     if not used:
+        if not found.count and np.ptp(frame.counts[np.isfinite(frame.counts)]) < 1.0:
+            doubt = ["its counts differ by less than 1: they are not those of the detector"]
         message = "; ".join(["shows no star that could be used", *doubt])
         raise bad_frame(message, f"{found.count} candidates")
     model = batch_of_stars(mission.name, known, digest, time, tracker, _observed(used, camera))
@@ -204,7 +206,8 @@ def doubt_of_exposure(
     remark = (
         f"exposure_doubtful: with {stated}, the candidates would be "
         f"{abs(off_mag):.1f} mag {'fainter' if off_mag > 0.0 else 'brighter'} than the stars of "
-        f"a field of this size: a factor of {10.0 ** (0.4 * abs(off_mag)):.2g}"
+        f"a field of this size: a factor of {10.0 ** (0.4 * abs(off_mag)):.2g} in the exposure or "
+        "in the unit of the counts"
     )
     return [remark]
 

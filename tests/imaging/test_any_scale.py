@@ -180,3 +180,24 @@ def test_a_spacecraft_s_camera_may_count_in_any_unit(missions, sky, factor):
             one.record.sigma_u_px, rel=1e-2, nan_ok=True
         )
         assert other.magnitude_mag == pytest.approx(one.magnitude_mag, abs=1e-3, nan_ok=True)
+
+
+@pytest.mark.parametrize("fill", [-32768.0, -9999.0, 1e20])
+@pytest.mark.parametrize("write", [REAL["FITS of -32"], npy_of], ids=["FITS", "npy"])
+def test_a_border_of_fill_values_hides_no_star_and_is_named(picture, fill, write):
+    values = picture.counts.astype("f4") / 65535.0
+    whole = find_points(read_frame(io.BytesIO(write(values)), LIMITS).counts).count
+    values[:12] = fill
+    frame = read_frame(io.BytesIO(write(values)), LIMITS)
+    assert np.isnan(frame.counts[:12]).all()
+    assert f"fill: {values[:12].size} pixels hold {fill:g}" in frame.remarks[-1]
+    assert find_points(frame.counts).count > 0.8 * whole
+
+
+@pytest.mark.parametrize("border", [0.0, 1.0])
+def test_pixels_cut_off_at_zero_or_at_one_are_no_fill_values(picture, border):
+    values = picture.counts.astype("f4") / picture.counts.max()
+    values[:12] = border
+    frame = read_frame(io.BytesIO(npy_of(values)), LIMITS)
+    assert np.array_equal(frame.counts, values)
+    assert not any("fill" in remark for remark in frame.remarks)

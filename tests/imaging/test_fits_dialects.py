@@ -282,7 +282,7 @@ NO_TIMES = {
     ),
     "an exposure of more than an hour": (
         {"DATE-OBS": NOON, "EXPTIME": 5000},
-        "EXPTIME is 5000 s, and may be from 0 to 3600 s",
+        "EXPTIME is 5000 s, which must be above 0 and at most 3600 s",
     ),
     "exposure in furlongs": ({"DATE-OBS": NOON, "EXPTIME": (1.0, "[furlong]")}, "no exposure"),
     "a Julian date of another day": (

@@ -198,3 +198,18 @@ def test_of_a_raw_file_the_pattern_is_summed(rng):
         read(dng(values), FrameLimits(max_pixels=3000))
     with pytest.raises(BadFile):
         read(dng(values)[:5000])
+
+
+@pytest.mark.parametrize(
+    ("start", "words"),
+    [
+        (b"BZh91AY&SY", "is packed .*gzip"),
+        (b"PK\x03\x04\x14\0", "is packed .*gzip"),
+        (b"\0\0\0\x1cftypheic", "is a HEIC or AVIF picture"),
+        (b"RIFF\0\0\0\0WEBPVP8 ", "is a WebP picture"),
+        (b"\x89HDF\r\n\x1a\n", "is an HDF5 file"),
+    ],
+)
+def test_a_file_in_other_packing_or_of_another_format_is_refused_by_its_name(start, words):
+    with pytest.raises(BadFile, match=words):
+        read_frame(io.BytesIO(start + bytes(200)), FrameLimits(1_000_000))

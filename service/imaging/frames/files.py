@@ -14,6 +14,7 @@ import tempfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pkgutil import resolve_name
 from typing import IO, Any
 
@@ -107,6 +108,38 @@ def as_counts(values: npt.NDArray[Any]) -> CountArray:
     return np.ascontiguousarray(values, dtype=np.float32 if exact else np.float64)
 
 
+LEAST_FILL, FILL_GAP = 64, 4.0
+"""Least number of pixels with a fill value, and its least distance from all other counts, in
+spans of these.
+"""
+
+
+def without_fill(frame: Frame) -> Frame:
+    """A frame of floating-point counts with NaN for a fill value, which a remark then names.
+
+    A fill value, such as -32768 or 1e20 beside counts of 0 to 1, is the least or largest count of
+    many pixels, far from all others. Single precision would lose the others beside it.
+    """
+    if not math.isinf(frame.full_scale):
+        return frame
+    counts, remarks = frame.counts, []
+    for lowest in (True, False):
+        known = counts[np.isfinite(counts)]
+        if not known.size:
+            break
+        value = known.min() if lowest else known.max()
+        rest = known[known != value]
+        number = known.size - rest.size
+        if number < LEAST_FILL or not rest.size > number:
+            continue
+        least, most = float(rest.min()), float(rest.max())
+        gap = least - float(value) if lowest else float(value) - most
+        if gap > FILL_GAP * (most - least) > 0.0:
+            counts = np.where(counts == value, np.nan, counts).astype(counts.dtype)
+            remarks.append(f"fill: {number} pixels hold {value:g}, which was taken for no number")
+    return replace(frame, counts=counts, remarks=(*frame.remarks, *remarks)) if remarks else frame
+
+
 def full_scale_of(dtype: np.dtype[Any]) -> float:
     """The largest number of an integer type; infinite for floating-point types."""
     return float(np.iinfo(dtype).max) if dtype.kind in "iu" else math.inf
@@ -115,6 +148,8 @@ def full_scale_of(dtype: np.dtype[Any]) -> float:
 Reader = Callable[[BoundedFile, FrameLimits, str], Frame]
 
 FORMATS = "FITS, TIFF, PNG, JPEG, GIF, BMP, PGM, a camera's raw file or a numpy array (.npy)"
+_BOXES = b"ftyp"
+"""The fifth to eighth byte of files of boxes (ISO 14496-12)."""
 _PDS3 = "a PDS3 file; write its image as FITS, TIFF or .npy (with pdr, GDAL or ISIS)"
 OTHERS: Mapping[bytes, str] = {
     b"LUCAM-RECORDER": "a SER video; export one frame of it as FITS or TIFF",
@@ -123,6 +158,13 @@ OTHERS: Mapping[bytes, str] = {
     b"ODL_VERSION_ID": _PDS3,
     b"CCSD3ZF": _PDS3,
     b"<?xml": "an XML label, as of PDS4; write its image as FITS, TIFF or .npy (with pdr)",
+    **dict.fromkeys(
+        (b"BZh", b"\xfd7zXZ", b"\x28\xb5\x2f\xfd", b"\x1f\x9d", b"PK\x03\x04", b"7z\xbc\xaf"),
+        "packed (bzip2, xz, Zstandard, .Z, zip or 7z); unpack it, or pack it with gzip",
+    ),
+    b"RIFF": "a WebP picture or a video; save it as PNG or TIFF",
+    _BOXES: "a HEIC or AVIF picture, or a video; save it as PNG or TIFF",
+    b"\x89HDF": "an HDF5 file; write its image as FITS, TIFF or .npy",
 }
 """Advice on image formats that are recognised by their first bytes but not read."""
 MORE_BYTES, BYTES_PER_PIXEL = 64 << 20, 24
@@ -160,9 +202,9 @@ def _read_by_magic(file: BoundedFile, start: bytes, limits: FrameLimits, digest:
         if start.startswith(magics):
             file.seek(0)
             with decoding("the picture that its first bytes name"):
-                return reader(file, limits, digest)
+                return without_fill(reader(file, limits, digest))
     for magic, words in OTHERS.items():
-        if start.startswith(magic):
+        if start.startswith(magic) or (magic == _BOXES and start[4:8] == magic):
             raise bad_frame(f"is {words}")
     raise bad_frame(f"is not {FORMATS}", f"its first bytes are {start[:8].hex(' ')}")
 

@@ -179,7 +179,9 @@ def exposure_of(header: Header) -> HeaderExposure:
     for key, (seconds, source) in found.items():
         if 0.0 < seconds <= LONGEST_EXPOSURE_S:
             return HeaderExposure(seconds, source)
-        problem = f"{key} is {seconds:g} s, and may be from 0 to {LONGEST_EXPOSURE_S:g} s"
+        problem = (
+            f"{key} is {seconds:g} s, which must be above 0 and at most {LONGEST_EXPOSURE_S:g} s"
+        )
         break
     return HeaderExposure(None, "", problem)
 

@@ -116,4 +116,5 @@ def require_light(frame: Frame, saturation_counts: float) -> None:
     full_counts = min(saturation_counts, frame.full_scale)
     full = np.count_nonzero(frame.counts >= full_counts) / known.size
     if full > MOST_FULL:
-        raise bad_frame("is saturated", f"{full:.0%} of its pixels are full")
+        message = f"is saturated, or in another unit: a pixel is full at {full_counts:g} counts"
+        raise bad_frame(message, f"{full:.0%} of its pixels are full")
