@@ -1,5 +1,6 @@
 """The result of one batch: tracker results, the attitude, a rival, provenance, and warnings."""
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from enum import StrEnum
 from typing import Literal
@@ -22,6 +23,7 @@ from service.missions.mission import Band, Mission
 from service.observations.batch import MeasuredAttitude, ObservationBatch
 from service.observations.calibrate import CorrectedObservations
 from service.sky.catalog.run_catalog import RunCatalog
+from service.sky.ephemeris import LIGHT_KM_PER_S, observer_velocity
 from service.sky.zones import SearchRegion
 from service.vectors import (
     Matrix,
@@ -257,7 +259,34 @@ def warnings_of_batch(batch: ObservationBatch, mission: Mission) -> list[str]:
             "velocity_of_earth_alone: no velocity_km_per_s was given; "
             "aberration was corrected for Earth's motion only"
         )
-    return warnings
+    return warnings + _of_velocity(batch)
+
+
+EARTH_KM_PER_S, NEAR_EARTHS_KM_PER_S = (17.0, 45.0), 12.0
+"""Speeds that include that of the Earth with an orbit about it, and the most of such an orbit."""
+
+
+def _of_velocity(batch: ObservationBatch) -> list[str]:
+    """The warning that a geocentric velocity is one about the Sun, of a spacecraft near the Earth.
+
+    Then it holds the velocity of the Earth, which aberration would count twice.
+    """
+    velocity = batch.velocity_km_per_s
+    if batch.aberration != "to_correct" or velocity is None:
+        return []
+    speed = math.hypot(*velocity.tolist())
+    if not EARTH_KM_PER_S[0] < speed < EARTH_KM_PER_S[1]:
+        return []
+    off = velocity - observer_velocity(batch.time, None) * LIGHT_KM_PER_S
+    off_km_per_s = math.hypot(*off.tolist())
+    if off_km_per_s > NEAR_EARTHS_KM_PER_S:
+        return []
+    warning = (
+        f"velocity_about_sun: velocity_km_per_s is {speed:.1f} km/s, and only {off_km_per_s:.1f} "
+        "km/s from the Earth's about the Sun; it must be relative to the Earth, whose motion is "
+        "counted twice otherwise"
+    )
+    return [warning]
 
 
 def warnings_of_attitude(

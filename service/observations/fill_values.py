@@ -33,10 +33,13 @@ def without_fill_values(batch: "BatchIn") -> "BatchIn":
     remarks = []
     for name in _VECTORS:
         vector = getattr(batch, name)
-        if vector is not None and not any(vector):
+        if vector is not None and len(set(vector)) == 1:
             changes[name] = None
-            remarks.append(f"{name}_not_given: {name} is zero, and was taken as not given")
-    _require_outside_earth(batch.position_km, batch.velocity_km_per_s)
+            shown = f"{vector[0]:g} three times" if vector[0] else "zero"
+            remarks.append(f"{name}_not_given: {name} is {shown}, and was taken as not given")
+    if "position_km" not in changes:
+        velocity = changes.get("velocity_km_per_s", batch.velocity_km_per_s)
+        _require_outside_earth(batch.position_km, velocity)
     observations = [_of_tracker(each, remarks) for each in batch.observations]
     if remarks:
         changes["observations"] = observations
@@ -86,7 +89,7 @@ def _key(star: "StarIn") -> tuple[Any, ...]:
 def _require_outside_earth(
     position_km: tuple[float, ...] | None, velocity_km_per_s: tuple[float, ...] | None
 ) -> None:
-    if position_km is None or not any(position_km):
+    if position_km is None:
         return
     distance_km = math.hypot(*position_km)
     message = None

@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from service.acquire import acquire
@@ -10,6 +11,7 @@ from service.errors import BadBatch
 from service.missions.mission import load_missions
 from service.observations.schema import fingerprint_of, submission_from_json
 from service.observations.telemetry import read_lines
+from service.sky.ephemeris import LIGHT_KM_PER_S, observer_velocity
 
 REPEATED = Path(__file__).parent / "repeated"
 XTE = load_missions()["XTE"]
@@ -57,14 +59,29 @@ def test_stars_that_differ_in_anything_stay_apart():
         assert batch.remarks == ()
 
 
+@pytest.mark.parametrize("number", [0.0, -99.99])
 @pytest.mark.parametrize("field", ["velocity_km_per_s", "position_km"])
-def test_a_velocity_or_a_position_of_zeros_is_not_given(field, sky):
-    body = bodies("ok.csv")[0] | {field: [0.0, 0.0, 0.0]}
+def test_a_velocity_or_a_position_of_one_number_three_times_is_not_given(field, number, sky):
+    body = bodies("ok.csv")[0] | {field: [number] * 3}
     submission, found = answered(body, sky)
     assert getattr(submission.batch, field) is None
     assert f"{field}_not_given" in codes(found.warnings)
     if field == "velocity_km_per_s":
         assert "velocity_of_earth_alone" in codes(found.warnings)
+
+
+@pytest.mark.parametrize(("about_earth", "is_said"), [(0.0, True), (1.0, True), (None, False)])
+def test_a_velocity_about_the_sun_is_said(about_earth, is_said, sky):
+    body = bodies("ok.csv")[0]
+    own = np.array(ORBIT["velocity_km_per_s"])
+    moment = submission_from_json(json.dumps(body)).batch.time
+    earth = observer_velocity(moment, None) * LIGHT_KM_PER_S
+    # A probe that is as fast as the Earth, the other way round.
+    velocity = -earth if about_earth is None else earth + about_earth * own
+    _, found = answered(body | {"velocity_km_per_s": velocity.tolist()}, sky)
+    assert ("velocity_about_sun" in codes(found.warnings)) == is_said
+    _, right = answered(body | {"velocity_km_per_s": own.tolist()}, sky)
+    assert "velocity_about_sun" not in codes(right.warnings)
 
 
 ORBIT = {"position_km": [-5782.8, -3856.1, 323.9], "velocity_km_per_s": [3.7556, -5.8787, -2.9363]}
