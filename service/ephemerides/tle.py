@@ -9,6 +9,7 @@ import codecs
 import math
 import re
 from bisect import bisect_left
+from collections.abc import Sequence
 from dataclasses import dataclass
 from operator import attrgetter
 from typing import IO, Any
@@ -25,6 +26,8 @@ from service.vectors import Matrix, Vector
 LENGTH = 69
 MAX_AGE_D = 7.0
 """Greatest difference in days to an element set's epoch: errors grow by 1 to 3 km per day."""
+MOST_OFF_AXIS = 0.05
+"""Largest difference of a state's semi-major axis from that of its set, as a share of it."""
 MOST_SETS = 100_000
 MAX_LINE_BYTES = 200
 _FIRST_CENTURY_YEAR = 57
@@ -77,7 +80,8 @@ class TleEphemeris:
     def at(self, moment: Utc) -> Vector | None:
         """Geocentric state (6,) in EME2000, km and km/s, from the set with the nearest epoch.
 
-        None more than `MAX_AGE_D` from every epoch, and if SGP4 finds that the object decayed.
+        None more than `MAX_AGE_D` from every epoch, if SGP4 finds that the object decayed, and if
+        it gives another orbit than the set describes, as far from the epoch of a decaying object.
         """
         after = bisect_left(self.sets, moment.tai_ns, key=attrgetter("epoch_ns"))
         beside = self.sets[max(after - 1, 0) : after + 1]
@@ -86,10 +90,21 @@ class TleEphemeris:
         if abs(since_s) > MAX_AGE_D * DAY_S:
             return None
         error, position_km, velocity_km_per_s = nearest.elements.sgp4_tsince(since_s / 60.0)
-        if error:
+        if error or not _is_of_orbit(nearest.elements, position_km, velocity_km_per_s):
             return None
         rotation = eme2000_from_teme(moment)
         return np.concatenate([rotation @ position_km, rotation @ velocity_km_per_s])
+
+
+def _is_of_orbit(
+    elements: Any, position_km: Sequence[float], velocity_km_per_s: Sequence[float]
+) -> bool:
+    """True if a state has about the semi-major axis of its set, by the energy of the orbit."""
+    inverse_km = (
+        2.0 / math.hypot(*position_km) - sum(v * v for v in velocity_km_per_s) / elements.mu
+    )
+    share = inverse_km * elements.a * elements.radiusearthkm
+    return abs(share - 1.0) < MOST_OFF_AXIS
 
 
 def eme2000_from_teme(moment: Utc) -> Matrix:

@@ -253,3 +253,19 @@ def test_the_name_is_the_line_above_the_first_set():
     found = read([*before, *MOLNIYA, "/EX"])
     assert found.object_name == "MOLNIYA 2-14"
     assert len(found.sets) == 1
+
+
+DECAYING = [
+    "1 55897U 22151AAV 25058.12407234  .09435527  24934+0  44853-1 0  9999",
+    "2 55897  98.5849 110.9278 0014449 269.2407  90.7207 15.92146194 26688",
+]
+
+
+def test_a_decaying_object_has_no_state_far_from_its_epoch():
+    """A public report: SGP4 puts it a million kilometres away, and names no error."""
+    known = read([with_checksum(line[:68] + "0") for line in DECAYING])
+    epoch = parse_utc("2025-02-27T02:58:40Z")
+    for days, is_known in ((-6.9, False), (-5.0, False), (-1.0, True), (0.0, True), (6.0, False)):
+        state = known.at(shifted(epoch, 86400.0 * days))
+        assert (state is not None) == is_known
+        assert state is None or 6500.0 < np.linalg.norm(state[:3]) < 6800.0
