@@ -9,7 +9,7 @@ import numpy as np
 from service.identify.blind.lens import Lens
 from service.identify.blind.solver import WIDEST_FIELD_DEG
 from service.identify.blind.verify import Verified
-from service.imaging.detection.points import MAX_POINTS, PointSources, has_dark
+from service.imaging.detection.points import MAX_POINTS, PointSources, find_points, has_dark
 from service.imaging.frames.frame import Frame
 from service.imaging.submit import exposure_stated
 
@@ -22,6 +22,8 @@ CLEAR_RATIO, LEAST_CLEAR = 12.0, 25
 CLIPPED_SHARE = 0.5
 BLURRED_PX = 3.5
 FEW_POINTS = 6
+FEW_BESIDE_DARK, LEAST_DARK, DARK_RATIO = 75, 30, 4
+"""Most points of light of a negative, its least number of dark points, and their least ratio."""
 NOTABLE_HOT = 20
 NOTABLE_BEND = 0.003
 NOTABLE_FOCAL = 0.005
@@ -60,6 +62,14 @@ def remarks_on(
 def advice_on(points: PointSources, frame: Frame, guess_px: float | None) -> Iterator[str]:
     """Likely reasons why a picture has no attitude, and options that were not tried."""
     dark = has_dark(frame)
+    if points.count < FEW_BESIDE_DARK:
+        dark_points = find_points(-frame.counts).count
+        if dark_points >= max(LEAST_DARK, DARK_RATIO * points.count):
+            yield (
+                f"negative: {dark_points} dark points, and {points.count} of light: if the sky is "
+                "brighter than the stars, invert the picture"
+            )
+            return
     if points.count < 4:
         yield (
             f"too_few_points: {points.count} points of light, and four are needed: expose longer, "

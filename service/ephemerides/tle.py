@@ -104,7 +104,7 @@ def _is_of_orbit(
         2.0 / math.hypot(*position_km) - sum(v * v for v in velocity_km_per_s) / elements.mu
     )
     share = inverse_km * elements.a * elements.radiusearthkm
-    return abs(share - 1.0) < MOST_OFF_AXIS
+    return bool(abs(share - 1.0) < MOST_OFF_AXIS)
 
 
 def eme2000_from_teme(moment: Utc) -> Matrix:

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.spatial import cKDTree
 
 from service.errors import BadFile
@@ -66,3 +67,19 @@ def test_two_images_of_each_star_are_refused_as_trailed(missions, sky):
     double = replace(drawn, counts=np.clip(twice, 0, 65535).astype(np.uint16))
     with pytest.raises(BadFile, match=r"is trailed: .* in two images of each"):
         submitted(missions["IMAGER"], double)
+
+
+def test_a_stretched_frame_of_stars_that_stand_still_is_not_called_trailed(missions, sky):
+    refusals = []
+    for drawn in drawn_frames(missions["IMAGER"], sky, 0.0, draws(4, 20)):
+        least, most = float(drawn.counts.min()), float(np.quantile(drawn.counts, 0.999))
+        grey = np.clip((drawn.counts - least) / (most - least) * 255.0, 0.0, 255.0)
+        file = io.BytesIO()
+        Image.fromarray(grey.astype(np.uint8)).convert("RGB").save(file, "PNG")
+        known = read_known({"time": drawn.known["time"]})
+        try:
+            submission_of_frame(file, DIGEST, known, missions["IMAGER"], 10_000_000)
+        except BadFile as refusal:
+            refusals.append(str(refusal))
+    assert refusals
+    assert all("stars are cut off at the largest count" in each for each in refusals)

@@ -10,6 +10,7 @@ import numpy as np
 
 from service.imaging.centroids.trail_fit import TrailPlaces
 from service.imaging.centroids.window import CentroidRecord, too_faint
+from service.imaging.detection.clipped import clipped_stars
 from service.imaging.detection.detect import Detections
 from service.imaging.detection.measure import MeasuredStar, chosen_stars
 from service.imaging.detection.points import (
@@ -71,6 +72,12 @@ def trails_of_frame(
     if trails is None:
         return expected
     if trails.refused is not None:
+        discs = clipped_stars(found.light) if expected is None else None
+        if discs is not None:
+            raise bad_frame(
+                f"is stretched or overexposed: {len(discs.u_px)} stars are cut off at the largest "
+                "count, and have neither places nor magnitudes; send the counts of the detector"
+            )
         raise bad_frame(_refusal(trails.length_px, trails.refused))
     return trails
 

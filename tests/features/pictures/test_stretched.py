@@ -124,3 +124,13 @@ def test_no_hint_asks_for_what_was_given(blind, rng):
             text = " ".join(solve_picture(frame, *blind, guess_px).remarks)
             assert ("--fov" in text) == (guess_px is None)
             assert ("--dark" in text) == (not has_dark)
+
+
+def test_a_negative_is_named_and_nothing_else_is_asked_for(blind, rng):
+    sky, solver = blind
+    lens = Lens(WIDTH, HEIGHT, focal_px_of(WIDTH, 40.0))
+    truth = draw_picture(rng, sky, lens=lens, off_center=0.0).attitude
+    counts = 255 - drawn_discs(rng, sky, truth, lens, 1.6, 0.4)
+    result = solve_picture(frame_of(counts), sky, solver)
+    assert result.attitude is None
+    assert [remark.partition(":")[0] for remark in result.remarks] == ["negative"]
