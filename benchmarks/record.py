@@ -31,19 +31,16 @@ CORE = (
     "service/times.py",
     "service/compiled",
     "service/vectors.py",
-    # Pictures of cameras without a mission: no batch passes through these.
-    ":!service/acquire/frame_submission.py",
-    ":!service/acquire/picture.py",
-    ":!service/identify/blind",
 )
 """What the answer to a batch depends on.  `:!` leaves out a file or a folder, as in git."""
-SIMULATOR = (
-    "service/simulate",
-    "tests/reference",
-    ":!service/simulate/frames.py",
-)
+SIMULATOR = ("service/simulate", "tests/reference")
 IMAGING = (
-    "service/imaging",
+    "service/features/pictures/centroids",
+    "service/features/pictures/detection",
+    "service/features/pictures/frames",
+    "service/features/pictures/kernels.py",
+    "service/features/pictures/tracker/overlay.py",
+    "service/features/pictures/tracker/submit.py",
     "studies/star_image_report",
     "studies/documents.py",
     "service/observations/scans/lines.py",

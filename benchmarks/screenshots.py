@@ -20,9 +20,9 @@ from tqdm import tqdm
 
 from service.app.factory import App, open_app
 from service.features.definitive.part import Definitive
+from service.features.pictures.tracker.simulated import FrameSettings, draw_frames, frame_bytes
 from service.missions.mission import load_missions
 from service.settings import Settings
-from service.simulate.frames import FrameSettings, draw_frames, frame_bytes
 from service.simulate.stretches import Pass
 from service.simulate.telemetry import GyroWanted, draw_pass, with_gyro
 from service.web.app import create_app

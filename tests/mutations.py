@@ -35,9 +35,9 @@ from service.ephemerides.tle import read_tle
 from service.errors import BadConfiguration, BadInput
 from service.features.packets.definition import PacketDefinition
 from service.features.packets.reader import PacketLines, PacketReader, archive_of
-from service.imaging.frames.files import read_frame
-from service.imaging.frames.fits import write_fits
-from service.imaging.frames.frame import FrameLimits
+from service.features.pictures.frames.files import read_frame
+from service.features.pictures.frames.fits import write_fits
+from service.features.pictures.frames.frame import FrameLimits
 from service.missions.mission import SHIPPED_FOLDER, load_missions, read_mission
 from service.observations.csv_rows import write_batches_csv
 from service.observations.decompress import MAX_LINE_BYTES, unpacked_lines
@@ -51,9 +51,9 @@ from service.sky.model import SkyModel
 from service.times import parse_utc
 from tests.ephemerides.orbits import ISS, oem_text, with_checksum
 from tests.features.packets.packing import mission_of_pass, packed, xtce
+from tests.features.pictures.colour_files import colours, dng, png_of_16_bits, tiff_of_16_bits
 from tests.features.products.series import GOLDEN, rows, slew
 from tests.features.products.series import written as aem_file
-from tests.imaging.colour_files import colours, dng, png_of_16_bits, tiff_of_16_bits
 from tests.sky.sky2000_records import SIRIUS, written
 
 AEM_EXAMPLES = Path(__file__).parent / "ephemerides" / "adm-examples"

@@ -208,10 +208,10 @@ def test_a_service_is_ready_without_what_is_used_later(tmp_path):
     assert not {each for each in loaded if each.startswith(("scipy.l", "scipy.s", "scipy.o"))}
     for late in (
         *("service.demo", "service.replay", "service.simulate", "studies"),
-        *("service.identify.blind", "service.identify.triangles", "service.imaging.detection"),
-        *("service.imaging.frames.fits", "service.features.pictures.overlay"),
+        *("service.features.pictures.blind", "service.features.pictures.detection"),
+        *("service.features.pictures.frames.fits", "service.features.pictures.overlay"),
         *("service.features.products.ck", "service.features.products.scoring"),
-        *("service.sky.whole_sky.quads", "service.storage.upkeep.archiving", "acquire_client"),
+        *("service.identify.triangles", "service.storage.upkeep.archiving", "acquire_client"),
     ):
         assert late not in loaded
 

@@ -114,3 +114,11 @@ def test_the_service_does_not_import_scipy_stats():
     importing = re.compile(r"^\s*(from|import) scipy\.stats\b", re.MULTILINE)
     files = (ROOT / "service").rglob("*.py")
     assert [name_of(f) for f in files if importing.search(f.read_text(encoding="utf-8"))] == []
+
+
+def test_only_the_feature_for_pictures_opens_images():
+    """The main job answers the stars of a batch without a library for images."""
+    importing = re.compile(r"^\s*(from|import) (PIL|sep|rawpy)\b", re.MULTILINE)
+    files = (ROOT / "service").rglob("*.py")
+    found = {name_of(f) for f in files if importing.search(f.read_text(encoding="utf-8"))}
+    assert {name.partition("/pictures/")[0] for name in found} == {"service/features"}

@@ -15,8 +15,13 @@ from urllib.parse import urlencode
 
 import numpy as np
 
+from service.features.pictures.tracker.simulated import (
+    FrameFormat,
+    FrameSettings,
+    draw_frames,
+    frame_bytes,
+)
 from service.missions.mission import Mission, load_missions
-from service.simulate.frames import FrameFormat, FrameSettings, draw_frames, frame_bytes
 from service.simulate.stretches import Pass, PriorKind, Trouble, Troubles
 from service.simulate.telemetry import draw_pass
 from service.sky.cache import LruCache

@@ -22,9 +22,9 @@ from benchmarks.bounds import Bound, at_most, between, every
 from benchmarks.record import IMAGING
 from benchmarks.report import Report
 from benchmarks.sections import Section, Written, table
-from service.imaging.centroids.centroid import METHODS, centroid
-from service.imaging.centroids.psf import GaussianPsf, Psf, airy_psf
-from service.imaging.centroids.window import Detector, cutout
+from service.features.pictures.centroids.centroid import METHODS, centroid
+from service.features.pictures.centroids.psf import GaussianPsf, Psf, airy_psf
+from service.features.pictures.centroids.window import Detector, cutout
 from tests.reference.star_windows import WindowStar, draw_stars, flux_of_peak
 
 RATIOS = (10.0, 30.0, 100.0, 300.0, 1000.0)

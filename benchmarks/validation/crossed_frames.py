@@ -34,14 +34,14 @@ from benchmarks.validation.frames import (
     Measured,
     measured_frame,
 )
-from service.imaging.centroids.centroid import METHODS
-from service.imaging.detection.detect import detect
-from service.imaging.detection.measure import measure
-from service.imaging.detection.star_images import psf_of
-from service.imaging.frames.frame import Frame
+from service.features.pictures.centroids.centroid import METHODS
+from service.features.pictures.detection.detect import detect
+from service.features.pictures.detection.measure import measure
+from service.features.pictures.detection.star_images import psf_of
+from service.features.pictures.frames.frame import Frame
+from service.features.pictures.tracker.simulated import DrawnFrame, FrameSettings, draw_frames
 from service.missions.camera import CentroidMethod, PsfKind
 from service.missions.mission import Mission, load_missions
-from service.simulate.frames import DrawnFrame, FrameSettings, draw_frames
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
@@ -51,7 +51,12 @@ CHUNK = 2
 COMPARED_EVERY = 10
 FOUND_LEAST = 0.99
 SPREAD = (0.9, 1.1)
-SOURCES = (*CORE, *IMAGING, "service/simulate/frames.py", "benchmarks/validation/frames.py")
+SOURCES = (
+    *CORE,
+    *IMAGING,
+    "service/features/pictures/tracker/simulated.py",
+    "benchmarks/validation/frames.py",
+)
 
 Errors = dict[str, list[float]]
 

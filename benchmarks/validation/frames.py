@@ -3,7 +3,7 @@
     python -m benchmarks.validation.frames --frames 1000 --seed 3    ten minutes on two cores
     python -m benchmarks.validation.frames --write                   docs/frames.md, its picture
 
-Every frame is drawn from the real sky with all its noise (`service.simulate.frames`), written
+Every frame is drawn from the real sky with all its noise (`pictures.tracker.simulated`), written
 as FITS and read again.  The batch made of it goes through the pipeline twice: with an a priori
 attitude good to 1 deg, and with none.
 """
@@ -32,15 +32,20 @@ from benchmarks.report import Report
 from benchmarks.sections import bounds_table, tables_of
 from service.acquire import Acquisition, acquire
 from service.errors import NotAvailable
-from service.imaging.detection.detect import detect, detection_kernel
-from service.imaging.frames.files import frame_digest, read_frame
-from service.imaging.frames.frame import Frame, FrameLimits
-from service.imaging.overlay import draw_overlay, marks_of
-from service.imaging.submit import read_known, submission_of_frame
+from service.features.pictures.detection.detect import detect, detection_kernel
+from service.features.pictures.frames.files import frame_digest, read_frame
+from service.features.pictures.frames.frame import Frame, FrameLimits
+from service.features.pictures.tracker.overlay import draw_overlay, marks_of
+from service.features.pictures.tracker.simulated import (
+    DrawnFrame,
+    FrameSettings,
+    draw_frames,
+    frame_bytes,
+)
+from service.features.pictures.tracker.submit import read_known, submission_of_frame
 from service.missions.camera import Camera
 from service.missions.mission import Mission, load_missions
 from service.observations.schema import Submission, submission_from_json
-from service.simulate.frames import DrawnFrame, FrameSettings, draw_frames, frame_bytes
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
@@ -72,7 +77,7 @@ CROSSED = "\n<!-- crossed wires -->\n"
 PICTURE = ROOT / "docs" / "images" / "overlay.png"
 
 
-SOURCES = (*CORE, *IMAGING, "service/simulate/frames.py")
+SOURCES = (*CORE, *IMAGING, "service/features/pictures/tracker/simulated.py")
 
 
 @dataclass

@@ -7,7 +7,10 @@ from benchmarks.sections import Section, Written, table
 from studies.star_image_report.claims import Row
 from studies.star_image_report.command import ROWS, run_imaging
 
-_REPORT, _FRAMES = "studies/star_image_report/test_further.py", "imaging/test_crossed_frames.py"
+_REPORT, _FRAMES = (
+    "studies/star_image_report/test_further.py",
+    "features/pictures/test_crossed_frames.py",
+)
 HELD_AGAINST = (
     ("rotation in the correlation", "a sum over a plane of its definition", _REPORT,
      "test_phi_of_a_field_is_the_integral_of_its_definition"),

@@ -59,7 +59,7 @@ class _Share(NamedTuple):
     whole_sky: list[str]
     """Names of the identifiers of the whole sky whose kernels the child compiles."""
     beside_batches: bool
-    """True if the child also compiles the kernels of features and of pictures."""
+    """True if the child also compiles the kernels of features."""
 
 
 def do_nothing() -> None:
@@ -86,7 +86,7 @@ class KernelBuild:
         kinds = {
             "batches with an a priori attitude": self.zones_needed,
             "searches of the whole sky": self.whole_sky_needed,
-            "frames, what-ifs, replays and filtered attitudes": self.is_needed,
+            "what-ifs, replays and what features compute": self.is_needed,
         }
         return [kind for kind, needed in kinds.items() if needed]
 

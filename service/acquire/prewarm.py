@@ -14,7 +14,6 @@ from service.acquire import acquire
 from service.errors import AcquisitionError
 from service.feature import SETTING, feature_modules
 from service.identify.prior_attitude import prior_attitude, search_region
-from service.imaging.frames.jpeg import compile_walk
 from service.missions.identifiers import IDENTIFIERS
 from service.missions.mission import Band, Mission
 from service.observations.batch import APriori, BoresightPrior, SunPointedPrior
@@ -152,10 +151,9 @@ def prewarm_kernels(
 
 
 def compile_beside_batches() -> None:
-    """Load or compile the kernels (compiled functions) of features and of the JPEG check."""
+    """Load or compile the kernels (compiled functions) of features."""
     for module in feature_modules("kernels", os.environ.get(SETTING, "")):
         module.compile_kernels()
-    compile_walk()
 
 
 def _prewarm_seldom(

@@ -9,7 +9,6 @@ from service.app.adoptions import CalibrationAdoptions
 from service.app.annotations import Annotations
 from service.app.context import Context
 from service.app.fleet import Spacecraft
-from service.app.frames import Frames
 from service.app.gyro import Gyro
 from service.app.replays import Replays
 from service.app.results import Comparisons, Results
@@ -80,7 +79,6 @@ class App:
         self.in_force = MissionsInForce(context.missions, context.store)
         self.adoptions = CalibrationAdoptions(context, self.in_force)
         self.submissions = SubmissionService(self.in_force, context.sky, context.store, kernels)
-        self.frames = Frames(context, self.submissions)
         self.results = Results(context, self.submissions)
         self.spacecraft = Spacecraft(context)
         self.gyro = Gyro(context)

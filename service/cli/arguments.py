@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
 SERVICE = "the service; default: ACQUIRE_HOST and ACQUIRE_PORT, else http://127.0.0.1:8000"
 MISSION = "XTE, SWAS, SOHO, the name of one of your own, or its file (.toml)"
-CAMERA_MISSION = "IMAGER, or one of your own whose tracker has a camera, or its file (.toml)"
 FILE_OR_NAME = "a mission file (.toml), or the name of a spacecraft"
 
 MOST_OPTIONS, MOST_FIRST = 8, 7
@@ -200,29 +199,19 @@ def add_command(
         brief = f"{summary.partition('. ')[0].rstrip('.')}."
         made = parent.add_parser(name, help=brief, **options)
         made.set_defaults(function=function)
-    _set_texts(made, summary, examples, notes)
+    lines = [line.strip() for line in examples.strip().splitlines()]
+    epilog = "examples:\n" + "\n".join(f"  {line}" for line in lines)
+    made.description = textwrap.fill(summary, 79)
+    made.epilog = f"{epilog}\n\n{notes}" if notes else epilog
     if isinstance(made, Parser):
         made.first = first.split()
     return made
-
-
-def describe(parser: argparse.ArgumentParser, function: Function, notes: str = "") -> None:
-    """Let a command that was added before run another function, whose docstring is the help."""
-    _set_texts(parser, *_help_of(function), notes)
-    parser.set_defaults(function=function)
 
 
 def _help_of(function: Function | None) -> tuple[str, str]:
     """The summary and the examples in the docstring of a command's function."""
     summary, _, examples = (inspect.getdoc(function) or "").partition("\n\n")
     return " ".join(summary.splitlines()), examples
-
-
-def _set_texts(parser: argparse.ArgumentParser, summary: str, examples: str, notes: str) -> None:
-    lines = [line.strip() for line in examples.strip().splitlines()]
-    epilog = "examples:\n" + "\n".join(f"  {line}" for line in lines)
-    parser.description = textwrap.fill(summary, 79)
-    parser.epilog = f"{epilog}\n\n{notes}" if notes else epilog
 
 
 def add_group(parent: Any, name: str, summary: str, examples: str) -> Any:

@@ -18,8 +18,6 @@ SOURCES = (
     "service/features/*/kernels*",
     "service/gyro/samples.py",
     "service/identify",
-    "service/imaging/frames/frame.py",
-    "service/imaging/frames/jpeg.py",
     "service/missions",
     "service/observations/batch.py",
     "service/observations/calibrate.py",

@@ -27,7 +27,6 @@ from service.web.api import (
     annotations,
     batches,
     events,
-    frames,
     probes,
     runs,
     spacecraft,
@@ -48,11 +47,10 @@ from service.web.requests.request_body import DEFAULT_LIMITS, BodyBudget, BodyLi
 log = logging.getLogger(__name__)
 
 WORKER_THREADS = 64
-"""Number of threads for request handlers; handlers of repeated frames wait in them."""
+"""Number of threads for request handlers; handlers of repeated posts wait in them."""
 
 ROUTERS: tuple[APIRouter, ...] = (
     batches.router,
-    frames.router,
     spacecraft.router,
     batches.gyro_router,
     batches.compare_router,

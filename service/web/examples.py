@@ -30,7 +30,6 @@ from service.missions.identifiers import IDENTIFIERS
 from service.missions.mission import load_missions
 from service.missions.motion import LiveFilterSettings
 from service.settings import Settings
-from service.simulate.frames import FrameSettings, draw_frames, frame_bytes
 from service.simulate.stretches import NO_TROUBLES, Pass
 from service.simulate.telemetry import draw_pass
 from service.sky.cache import LruCache
@@ -66,15 +65,6 @@ class Walk:
         wanted_pass = Pass(batches=1, troubles=NO_TROUBLES, angles_share=0.0, **wanted)
         (drawn,) = draw_pass(load_missions()[spacecraft], self.sky, wanted_pass)
         return drawn.batch
-
-    def frame(self) -> tuple[Json, bytes]:
-        """Frame of a tracker: the query that describes it, and its file."""
-        (drawn,) = draw_frames(load_missions()["IMAGER"], self.sky, FrameSettings(frames=1))
-        query = {
-            name: value if isinstance(value, str) else json.dumps(value)
-            for name, value in drawn.known.items()
-        }
-        return query, frame_bytes(drawn)
 
     def ended(self, address: str) -> httpx.Response:
         """Answer about work in the background when it is over."""
@@ -112,7 +102,7 @@ def walk(client: httpx.Client, app: App, sky: SkyModel) -> Json:
 
 
 def _batches(walk: Walk) -> Json:
-    """Send batches and frames; the first batch."""
+    """Send batches; the first batch."""
     client, take = walk.client, walk.take
 
     def submit(name: str, body: Json, **headers: str) -> Json:
@@ -135,17 +125,11 @@ def _batches(walk: Walk) -> Json:
     take("submit_batch", truncated, "truncated")
     take("submit_batch", client.post(f"{API}/batches", content=b"{}"), "no_content_type")
 
-    frame, file = walk.frame()
     new = xte | {"batch": "1999-060-0003"}
     asked: Any = [new, xte, other, xte | {"spacecraft": "NOPE"}]
     sent = client.post(f"{API}/batches/many", json=asked)
     take("submit_batches", sent, "new_recorded_conflict_unknown", asked)
     take("submit_batches", client.post(f"{API}/batches/many", json=[]), "none")
-
-    take("submit_frame", _send(client, "IMAGER", frame, file), "attitude")
-    cut_off = frame | {"batch": "cut-off"}
-    take("submit_frame", _send(client, "IMAGER", cut_off, file[:5760]), "cut_off")
-    take("submit_frame", _send(client, "XTE", frame, file), "no_camera")
 
     here = f"{API}/batches/{first['id']}"
     asked = {"options": {"identifier": "starid", "tolerances": {"separation_deg": 0.02}}}
@@ -267,12 +251,6 @@ def _sign_in(walk: Walk) -> None:
     take("sign_out", client.delete(f"{API}/session", headers=same), "signed_out")
 
 
-def _send(client: httpx.Client, spacecraft: str, query: Json, file: bytes) -> httpx.Response:
-    headers = {"Content-Type": "application/fits"}
-    url = f"{API}/spacecraft/{spacecraft}/frames"
-    return client.post(url, params=query, content=file, headers=headers)
-
-
 @contextmanager
 def _served(app: App) -> Iterator[str]:
     """Address of a server of an app, in a thread of this process."""
@@ -325,12 +303,6 @@ def write(found: Json) -> None:
         file = Path(str(files(package)), EXAMPLES)
         text = json.dumps(part, indent=1, ensure_ascii=False) + "\n"
         file.write_text(text, encoding="utf-8")
-
-
-if __name__ == "__main__":
-    # With `--help` the parser ends the program before it writes the file.
-    argparse.ArgumentParser(prog="python -m tests.web.examples", description=__doc__).parse_args()
-    write(fresh_walk())
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ from service.web.middleware import API
 from service.web.requests.access import POLICIES, Policy
 from service.web.requests.problems import MEDIA_TYPE as PROBLEM_JSON
 from service.web.requests.query_parameters import NO_QUERY, TIME_SCHEMA
-from service.web.requests.request_body import BINARY, FRAMES, JSON
+from service.web.requests.request_body import BINARY, JSON
 
 Handler = TypeVar("Handler", bound=Callable[..., Any])
 
@@ -84,7 +84,7 @@ _PROBLEMS = {
     503: "The service is busy or unavailable; `Retry-After` says when to try again.",
 }
 READING_JSON = (400, 408, 413, 415, 503)
-READING_NDJSON = READING_FRAME = (408, 413, 415)
+READING_NDJSON = READING_FILE = (408, 413, 415)
 _BINARY = {"type": "string", "format": "binary"}
 _RETRY_AFTER = _header("Retry-After", "Seconds.")
 _CHALLENGE = _header("WWW-Authenticate", "Bearer.")
@@ -186,7 +186,7 @@ class ApiRouter(APIRouter):
         body_required: bool = True,
         lines_of: type[BaseModel] | None = None,
         array_of: tuple[type[BaseModel], int] | None = None,
-        frame: bool = False,
+        files: Sequence[str] = (),
         problems: Sequence[int] = (),
         parameters: Sequence[Mapping[str, Any]] = (),
         dependencies: Sequence[Any] = (),
@@ -199,6 +199,7 @@ class ApiRouter(APIRouter):
         Without `body_required` the body may be left out: its fields all have defaults.
         In place of `lines_of` a model, every input format that has a media type can be sent.
         `array_of` is the model of an array's elements, and how many there may be.
+        `files` are the media types of a file that is sent.
         """
         content: dict[str, Any] = {}
         reading: Sequence[int] = ()
@@ -217,9 +218,9 @@ class ApiRouter(APIRouter):
                 if name != NDJSON and each.media_types:
                     schema = _BINARY | {"description": each.uploaded}
                     content[each.media_types[0]] = {"schema": schema}
-        if frame:
+        if files:
             file = {"schema": _BINARY}
-            content, reading = dict.fromkeys(FRAMES, file), READING_FRAME
+            content, reading = dict.fromkeys(files, file), READING_FILE
         extra: dict[str, Any] = {}
         if content:
             extra["requestBody"] = {"required": body_required, "content": content}

@@ -28,7 +28,7 @@ ROWS: Mapping[str, Callable[[Study], Row]] = {
 
 _INTRODUCTION = """\
 For optical engineers who know the star image detection report: each of its claims, checked.
-Apertures, spectra, images and centroids are in `service/imaging`, scans
+Apertures, spectra, images and centroids are in `service/features/pictures/centroids`, scans
 in `service/observations/scans`, the other systems in `studies/star_image_report`. A claim
 is *confirmed* where ours agrees, *corrected* where the report has a slip that ours mends,
 *qualified* where it is right within limits that are measured here, *added* where ours goes beyond

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from scipy.ndimage import map_coordinates, maximum_filter
 
 from service.errors import BadInput, Fault
-from service.imaging.centroids.window import Array
+from service.features.pictures.centroids.window import Array
 from studies.star_image_report.claims import Claim, Picture, Study
 
 

@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from service.imaging.centroids.sequential import StateEstimate, batch, diffuse
-from service.imaging.centroids.window import Array
+from service.features.pictures.centroids.sequential import StateEstimate, batch, diffuse
+from service.features.pictures.centroids.window import Array
 from studies.star_image_report import measurements
 from studies.star_image_report.claims import Claim, Picture, Row, Study
 from studies.star_image_report.measurements import Hump, StopRule, hump_of, recentred

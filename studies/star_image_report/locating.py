@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from service.imaging.centroids.psf import GaussianPsf, airy_psf, wired_psf
-from service.imaging.centroids.window import Array
-from service.imaging.detection.star_images import AIRY_OVER_SIGMA
-from service.imaging.optics import behind_wires, disc
+from service.features.pictures.centroids.optics import behind_wires, disc
+from service.features.pictures.centroids.psf import GaussianPsf, airy_psf, wired_psf
+from service.features.pictures.centroids.window import Array
+from service.features.pictures.detection.star_images import AIRY_OVER_SIGMA
 from service.vectors import ARCSEC_PER_RADIAN
 from studies.star_image_report import correlate, sun_tracker
 from studies.star_image_report.claims import Claim, Picture, Row, Study

@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from service.imaging.centroids.sequential import StateEstimate, diffuse
-from service.imaging.centroids.window import Array
+from service.features.pictures.centroids.sequential import StateEstimate, diffuse
+from service.features.pictures.centroids.window import Array
 from studies.star_image_report.claims import Claim, Picture, Study
 
 

@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from service.imaging.centroids.window import Array
-from service.imaging.optics import Pupil, centres, image_at, thermal
+from service.features.pictures.centroids.optics import Pupil, centres, image_at, thermal
+from service.features.pictures.centroids.window import Array
 from studies.star_image_report import wires_and_lines
 from studies.star_image_report.claims import Claim, Picture, Row, Study
 from studies.star_image_report.optics import DIAMETER_M, LASER_M

@@ -7,8 +7,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import j1, jn_zeros
 
-from service.imaging.centroids.window import Array
-from service.imaging.optics import LIGHT_SPEED_M_PER_S, disc
+from service.features.pictures.centroids.optics import LIGHT_SPEED_M_PER_S, disc
+from service.features.pictures.centroids.window import Array
 from studies.star_image_report.claims import Claim, Picture, Row, Study
 from studies.star_image_report.transfer import (
     autocorrelation,

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from service.errors import BadInput, Fault
-from service.imaging.centroids.psf import GaussianPsf
-from service.imaging.centroids.window import Array
+from service.features.pictures.centroids.psf import GaussianPsf
+from service.features.pictures.centroids.window import Array
 from service.observations.scans.lines import line_peaks
 from service.sky.catalog.star_catalog import load_embedded
 from service.vectors import ARCSEC_PER_RADIAN, unit

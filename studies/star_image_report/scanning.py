@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from service.errors import BadInput, Fault
-from service.imaging.centroids.window import Array
-from service.imaging.optics import disc
+from service.features.pictures.centroids.optics import disc
+from service.features.pictures.centroids.window import Array
 from service.observations.scans.lines import ProfileMoment, ScanResult, cross_scan, moment
 from studies.star_image_report.claims import Claim, Picture, Row, Study
 from studies.star_image_report.optics import DIAMETER_M, LASER_M

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from service.imaging.centroids.window import Array
+from service.features.pictures.centroids.window import Array
 from studies.star_image_report.claims import Claim, Picture, Study
 from studies.star_image_report.wires import INCH_M, Mesh
 

@@ -10,8 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from service.imaging.centroids.window import Array
-from service.imaging.optics import LIGHT_SPEED_M_PER_S, Pupil, Spectrum, image_at
+from service.features.pictures.centroids.optics import (
+    LIGHT_SPEED_M_PER_S,
+    Pupil,
+    Spectrum,
+    image_at,
+)
+from service.features.pictures.centroids.window import Array
 
 
 @dataclass(frozen=True)

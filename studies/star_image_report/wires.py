@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from service.imaging.centroids.window import Array
-from service.imaging.optics import Pupil, disc, image_at
+from service.features.pictures.centroids.optics import Pupil, disc, image_at
+from service.features.pictures.centroids.window import Array
 from studies.star_image_report.transfer import between_wires, image_by_fft
 
 INCH_M = 0.0254

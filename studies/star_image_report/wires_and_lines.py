@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from service.imaging.centroids.window import Array
-from service.imaging.optics import LIGHT_SPEED_M_PER_S, Spectrum
+from service.features.pictures.centroids.optics import LIGHT_SPEED_M_PER_S, Spectrum
+from service.features.pictures.centroids.window import Array
 from studies.star_image_report.claims import Claim, Picture, Study
 from studies.star_image_report.optics import DIAMETER_M, LASER_M
 from studies.star_image_report.transfer import mean_wavelength_m

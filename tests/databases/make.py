@@ -35,8 +35,8 @@ from sqlalchemy import Connection, create_engine, make_url, text
 from sqlalchemy.pool import NullPool
 from tqdm import tqdm
 
+from service.features.pictures.tracker.simulated import FrameSettings, draw_frames, frame_bytes
 from service.missions.mission import load_missions
-from service.simulate.frames import FrameSettings, draw_frames, frame_bytes
 from service.simulate.stretches import Pass, Trouble, Troubles
 from service.simulate.telemetry import draw_pass
 from service.sky.cache import LruCache

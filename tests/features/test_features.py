@@ -53,20 +53,48 @@ def test_options_of_a_feature_that_is_off_are_not_there():
     assert found == {"packets", "xtce", "spacecraft"}
 
 
-def test_frames_are_of_a_spacecraft_where_pictures_of_any_camera_are_off(
-    acquire, monkeypatch, tmp_path
-):
-    monkeypatch.setenv("ACQUIRE_FEATURES_OFF", "pictures")
-    code, _, complaint = acquire("frame", "holiday.jpg")
-    assert (code, complaint) == (
-        2,
-        "acquire: --spacecraft: must name the spacecraft whose camera took the frames\n",
+FRAME_READ = """
+import io, sys
+from service.app.factory import open_app
+from service.features.pictures.part import Pictures
+from service.features.pictures.tracker.simulated import FrameSettings, draw_frames, frame_bytes
+from service.features.pictures.tracker.submit import read_known
+from service.settings import Settings
+
+app = open_app(Settings(database="sqlite:///" + sys.argv[1], replay_processes=0))
+(drawn,) = draw_frames(app.missions["IMAGER"], app.sky, FrameSettings(frames=1))
+file = io.BytesIO(frame_bytes(drawn))
+print(app.part(Pictures).frames.submit("IMAGER", read_known(drawn.known), file).id)
+app.close()
+"""
+
+
+def test_a_recorded_frame_can_be_read_where_frames_are_off(tmp_path):
+    sent = [sys.executable, "-c", FRAME_READ, str(tmp_path / "acquire.db")]
+    run = subprocess.run(sent, cwd=ROOT, capture_output=True, text=True, check=True)
+    id = run.stdout.strip()
+    batch, page, overlay = (
+        f"/api/v1/batches/{id}",
+        f"/batches/{id}",
+        f"/api/v1/batches/{id}/overlay",
     )
-    assert acquire("frame", "holiday.jpg", "--fov", "20")[0] == 2
-    acquire("simulate", "frames", "--spacecraft", "IMAGER", "--frames", 1, "drawn")
-    (frame,) = (tmp_path / "drawn").glob("*.fits")
-    code, out, _ = acquire("frame", frame, "--spacecraft", "IMAGER", "--in-process")
-    assert (code, "  good  " in out) == (0, True)
+    commands, modules, found = served(tmp_path, "pictures", batch, page, overlay)
+    assert not commands & {"frame", "camera"}
+    assert [found[each][0] for each in (batch, page, overlay)] == [200, 200, 404]
+    assert '"preview_step"' not in found[batch][1]
+    assert '"candidates"' in found[batch][1]
+    assert overlay not in found[page][1]
+    assert not {"PIL", "sep", "service.features.pictures.part"} & modules
+    _, _, found = served(tmp_path, "", page, overlay)
+    assert [each[0] for each in found.values()] == [200, 200]
+    assert overlay in found[page][1]
+
+
+def test_frames_are_simulated_only_where_frames_are_on():
+    def simulated(off):
+        return {*build_parser(off).commands.choices["simulate"].commands.choices}
+
+    assert simulated("") - simulated("pictures") == {"frames"}
 
 
 def test_a_name_of_no_feature_is_refused_with_the_names_of_all(acquire, monkeypatch):
@@ -153,13 +181,13 @@ def test_with_every_feature_off_the_pages_are_there_and_nothing_of_a_feature_is(
     history = "/api/v1/spacecraft/XTE/history?format=csv"
     gone = ("/webhooks", "/alarms", "/api/v1/alarms", "/api/v1/spacecraft/XTE/tracks")
     gone += ("/spacecraft/XTE/files", "/api/v1/spacecraft/XTE/attitude")
-    gone += ("/pictures", "/api/v1/pictures")
+    gone += ("/pictures", "/api/v1/pictures", "/api/v1/spacecraft/IMAGER/frames")
     gone += ("/spacecraft/XTE/grades", "/api/v1/spacecraft/XTE/definitive-attitude")
     off = ",".join(SHIPPED)
     commands, modules, found = served(
         tmp_path, off, *pages, *gone, history, "/metrics", sent="docs/example-batch.json"
     )
-    assert not commands & {*SHIPPED, "export", "score", "calibrate", "camera", "smooth"}
+    assert not commands & {*SHIPPED, "export", "score", "calibrate", "camera", "frame", "smooth"}
     assert {"serve", "replay", "history"} <= commands
     assert [found[each][0] for each in pages] == [200] * len(pages)
     assert found[history][0] == 200
@@ -174,6 +202,7 @@ def test_with_every_feature_off_the_pages_are_there_and_nothing_of_a_feature_is(
     for gone_page in ("/alarms", "/calibration", "/files", "/attitude?", "/grades", "/pictures"):
         assert gone_page not in shown
     loaded = {each for each in modules if each.startswith("service.features.")}
+    assert not {"PIL", "sep"} & modules
     # The names of the features, and the tables, which stay in the database.
     assert loaded <= {f"service.features.{name}" for name in SHIPPED} | {
         f"service.features.{name}.tables" for name in SHIPPED

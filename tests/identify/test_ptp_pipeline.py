@@ -8,9 +8,9 @@ import pytest
 from msgspec import structs
 
 from service.acquire import acquire
-from service.imaging.detection.points import find_points
-from service.imaging.frames.files import read_frame
-from service.imaging.frames.frame import FrameLimits
+from service.features.pictures.detection.points import find_points
+from service.features.pictures.frames.files import read_frame
+from service.features.pictures.frames.frame import FrameLimits
 from service.missions.mission import Mission, parse_mission
 from service.observations.schema import submission_from_json
 from service.sky.whole_sky.guide import GuideKey

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from service.imaging.centroids.psf import Psf
-from service.imaging.centroids.window import Detector, Window
+from service.features.pictures.centroids.psf import Psf
+from service.features.pictures.centroids.window import Detector, Window
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,11 @@ from sqlalchemy import create_engine, insert, select, text, update
 
 from service.errors import Busy
 from service.features.definitive.part import Definitive
+from service.features.pictures.part import Pictures
+from service.features.pictures.tracker.simulated import FrameSettings, draw_frames, frame_bytes
+from service.features.pictures.tracker.submit import read_known
 from service.gyro.blocks import GyroBlockIn, block_from_model
-from service.imaging.submit import read_known
 from service.observations.schema import OptionsIn
-from service.simulate.frames import FrameSettings, draw_frames, frame_bytes
 from service.storage.projections import heads, seals
 from service.storage.projections.rollups import lock_position
 from service.storage.recording.identity import SETTINGS, digest_of, digest_of_row
@@ -80,7 +81,11 @@ def fill(app, make, missions):
     ]
     (drawn,) = draw_frames(missions["IMAGER"], app.sky, FrameSettings(frames=1, seed=5))
     content = frame_bytes(drawn)
-    _patiently(lambda: app.frames.submit("IMAGER", read_known(drawn.known), io.BytesIO(content)))
+    _patiently(
+        lambda: app.part(Pictures).frames.submit(
+            "IMAGER", read_known(drawn.known), io.BytesIO(content)
+        )
+    )
     rates = [(0.0, 0.0, 0.0)] * 3_001
     gyro = GyroBlockIn(block="g1", start=START.text, step_s=1.0, rates_rad_per_s=rates)
     app.gyro.record(block_from_model(gyro, "XTE"))

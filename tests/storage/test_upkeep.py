@@ -28,10 +28,11 @@ from sqlalchemy.exc import IntegrityError
 
 from service.app.factory import open_app
 from service.errors import BadConfiguration
-from service.imaging.submit import read_known
+from service.features.pictures.part import Pictures
+from service.features.pictures.tracker.simulated import FrameSettings, draw_frames, frame_bytes
+from service.features.pictures.tracker.submit import read_known
 from service.observations.schema import OptionsIn, submission_from_json
 from service.settings import Settings
-from service.simulate.frames import FrameSettings, draw_frames, frame_bytes
 from service.storage.projections import rollups
 from service.storage.projections.projector import rebuild_trends
 from service.storage.recording.identity import digest_of
@@ -372,7 +373,7 @@ def framed(app, missions):
     """The id of a batch that was made of a frame."""
     (drawn,) = draw_frames(missions["IMAGER"], app.sky, FrameSettings(frames=1, seed=5))
     known = read_known(drawn.known)
-    return app.frames.submit("IMAGER", known, io.BytesIO(frame_bytes(drawn))).id
+    return app.part(Pictures).frames.submit("IMAGER", known, io.BytesIO(frame_bytes(drawn))).id
 
 
 def test_a_sound_batch_made_of_a_frame_is_not_called_damaged(app, framed, database):

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from service.cli import main
+from tests.features.pictures.hostile_headers import absurd_files
 from tests.fresh_databases import sqlite_at
-from tests.imaging.hostile_headers import absurd_files
 from tests.mutations import NAMES, Readers, mutated, with_right_sums
 from tests.scale import size
 from tests.web.serving import ended

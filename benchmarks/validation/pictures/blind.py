@@ -31,7 +31,7 @@ from benchmarks.record import record_of
 from benchmarks.report import Report
 from benchmarks.validation.pictures.document import SOURCES, write_part
 from benchmarks.validation.pictures.peers import YEAR, PictureSolver, solvers
-from service.acquire.picture import blind_sky
+from service.features.pictures.blind.picture import blind_sky
 from service.sky.catalog.star_catalog import load_embedded
 from service.vectors import ARCSEC_PER_RADIAN, Matrix, Vector, attitude_error_arcsec
 from tests.features.pictures.drawn import draw_picture, middle_attitude

@@ -25,11 +25,11 @@ from benchmarks.bounds import at_least, between
 from benchmarks.record import record_of
 from benchmarks.report import Report
 from benchmarks.validation.pictures.document import SOURCES, write_part
-from service.acquire.picture import PictureResult, blind_sky, solve_picture
+from service.features.pictures.blind.lens import Lens
+from service.features.pictures.blind.picture import PictureResult, blind_sky, solve_picture
+from service.features.pictures.blind.solver import focal_px_of, rotation_between
 from service.features.pictures.camera_calibration import CameraCalibration, calibrate_camera
-from service.identify.blind.lens import Lens
-from service.identify.blind.solver import focal_px_of, rotation_between
-from service.imaging.frames.frame import Frame
+from service.features.pictures.frames.frame import Frame
 from service.sky.catalog.star_catalog import load_embedded
 from tests.features.pictures.drawn import SIZES, DrawnPicture, draw_picture
 

@@ -7,12 +7,10 @@ from benchmarks.sections import tables_of
 DOCUMENT = ROOT / "docs" / "cameras.md"
 SOURCES = (
     "catalogs/stars.npz",
-    "service/acquire/picture.py",
     "service/features/pictures/camera_calibration.py",
-    "service/identify/blind",
-    "service/imaging/detection/points.py",
-    "service/imaging/frames",
-    "service/sky/whole_sky",
+    "service/features/pictures/blind",
+    "service/features/pictures/detection/points.py",
+    "service/features/pictures/frames",
     "service/vectors.py",
     "tests/features/pictures/drawn.py",
     "benchmarks/validation/pictures",

@@ -25,10 +25,10 @@ from benchmarks.report import Report
 from benchmarks.validation.pictures.blind import PICTURES, drawn_picture, is_right, real_pictures
 from benchmarks.validation.pictures.document import write_part
 from benchmarks.validation.pictures.peers import YEAR, focal_px
-from service.acquire.picture import blind_sky, solve_picture
-from service.identify.blind.solver import WIDEST_FIELD_DEG, FocalRange
-from service.identify.blind.verify import Points
-from service.imaging.frames.frame import Frame
+from service.features.pictures.blind.picture import blind_sky, solve_picture
+from service.features.pictures.blind.solver import WIDEST_FIELD_DEG, FocalRange
+from service.features.pictures.blind.verify import Points
+from service.features.pictures.frames.frame import Frame
 from service.sky.catalog.star_catalog import load_embedded
 from service.vectors import Vector, attitude_error_arcsec
 

@@ -20,10 +20,10 @@ import numpy as np
 from PIL import Image
 
 from benchmarks.validation.lost_in_space.peers import CACHE
-from service.acquire.picture import blind_sky, solve_picture
-from service.imaging.frames.frame import Frame
+from service.features.pictures.blind.bright_stars import BrightStars
+from service.features.pictures.blind.picture import blind_sky, solve_picture
+from service.features.pictures.frames.frame import Frame
 from service.sky.catalog.star_catalog import load_embedded
-from service.sky.whole_sky.bright_stars import BrightStars
 from service.vectors import Matrix, from_ra_dec, ra_dec_of
 
 YEAR = 2020

@@ -1,5 +1,5 @@
-"""Pictures of any camera: attitude and lens without a mission, and cameras calibrated by them."""
+"""Star images: frames of spacecraft, and pictures of any camera without a mission."""
 
 from service.feature import Feature
 
-FEATURE = Feature("pictures", __name__, ("part", "command", "routes", "pages"))
+FEATURE = Feature("pictures", __name__, ("kernels", "part", "command", "routes", "pages"))

@@ -10,26 +10,23 @@ from typing import TYPE_CHECKING, Any
 
 from msgspec import to_builtins
 
-from service.cli.arguments import degrees, describe, positive, settings_of
-from service.cli.commands.frame import SIDECAR
-from service.cli.commands.frame import run as submit_frames
+from service.cli.arguments import degrees, positive
 from service.errors import BadInput, Fault, printable, shown_value
 from service.settings import Settings
 
 if TYPE_CHECKING:
     from argparse import _ArgumentGroup as ArgumentGroup  # it has no public name
 
-    from service.acquire.picture import PictureResult
-    from service.imaging.frames.frame import Frame
+    from service.features.pictures.blind.picture import PictureResult
+    from service.features.pictures.frames.frame import Frame
 
 FEW_NAMES = 12
 LEAST_MEGAPIXELS = 64
 """Least limit in megapixels for pictures on this computer, higher than for uploads."""
 
 
-def extend(parser: ArgumentParser) -> None:
-    """Let `acquire frame` take pictures without a spacecraft, with options for their lens."""
-    describe(parser, run, SIDECAR)
+def add_lens_options(parser: ArgumentParser) -> None:
+    """Declare the options for pictures without a spacecraft, whose lens is fitted."""
     lens = parser.add_argument_group(
         "without a spacecraft",
         "known data of any camera; values of its lens may be wrong by a quarter",
@@ -61,32 +58,19 @@ def add_camera_options(options: "ArgumentParser | ArgumentGroup") -> None:
     )
 
 
-def run(parsed: Namespace) -> int:
-    """Detect the stars in frames and pictures (FITS, TIFF, PNG, JPEG, GIF, BMP, PGM, raw, .npy),
-    identify them and solve for the attitude.  Frames of a spacecraft are recorded; one that is
-    sent again returns the first answer.  Without a spacecraft a picture may be from any camera:
-    its lens is fitted with the attitude, nothing is recorded, and the overlay is FILE-stars.png.
-
-    acquire frame holiday.jpg                    any camera, any lens
-    acquire frame holiday.jpg --focal-mm 50 --pixel-um 4.8 --overlay stars.png
-    acquire frame frames/*.fits --spacecraft IMAGER --overlay pictures/
-    acquire frame one.fits --spacecraft IMAGER --in-process --overlay one.png
-    acquire frame one.png --spacecraft IMAGER --time 2026-03-01T00:00:00Z --json
-    """
-    if parsed.spacecraft is None:
-        return solve_pictures(parsed, settings_of(parsed))
+def refuse_lens_options(parsed: Namespace) -> None:
+    """Raise `BadInput` for data of a lens that are given beside a spacecraft."""
     for name in ("fov", "lens", "pixel_ratio", "focal_px", "focal_mm", "pixel_um", "dark"):
         value = getattr(parsed, name)
         if value is not None:
             message = "goes without --spacecraft; a mission's file describes its camera"
             raise BadInput(Fault(f"--{name.replace('_', '-')}", message, shown_value(str(value))))
-    return submit_frames(parsed)
 
 
 def solve_pictures(parsed: Namespace, settings: Settings) -> int:
     """Solve each picture file and print its result; returns 1 if any fails, otherwise 0."""
-    from service.acquire.picture import blind_sky, solve_picture
-    from service.acquire.square_pixels import require_ratio
+    from service.features.pictures.blind.picture import blind_sky, solve_picture
+    from service.features.pictures.blind.square_pixels import require_ratio
     from service.features.pictures.records import picture_of
     from service.sky.catalog.star_catalog import open_catalog
 
@@ -125,9 +109,9 @@ def picture_reader(
     dark_file: Path | None, settings: Settings, image: str | None = None
 ) -> "Callable[[Path, tuple[int, int] | None], Frame]":
     """Create a function that reads a picture, checks its shape and subtracts the dark frame."""
-    from service.imaging.detection.points import without_dark
-    from service.imaging.frames.files import read_frame
-    from service.imaging.frames.frame import FrameLimits
+    from service.features.pictures.detection.points import without_dark
+    from service.features.pictures.frames.files import read_frame
+    from service.features.pictures.frames.frame import FrameLimits
 
     max_pixels = 1_000_000 * max(settings.frame_megapixels, LEAST_MEGAPIXELS)
 
@@ -146,7 +130,7 @@ def picture_reader(
 
 def focal_guess_px(parsed: Namespace, width_px: int, height_px: int) -> float | None:
     """Approximate focal length in pixels from the options; None without any."""
-    from service.acquire.picture import focal_px_of_field
+    from service.features.pictures.blind.picture import focal_px_of_field
 
     if parsed.focal_px is not None:
         return float(parsed.focal_px)

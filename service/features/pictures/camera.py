@@ -10,11 +10,11 @@ from service.errors import BadInput, Fault, printable, shown_value
 from service.features.pictures.any_camera import add_camera_options, focal_guess_px, picture_reader
 
 if TYPE_CHECKING:
-    from service.acquire.picture import PictureResult
+    from service.features.pictures.blind.bright_stars import BrightStars
+    from service.features.pictures.blind.picture import PictureResult
+    from service.features.pictures.blind.solver import BlindSolver
     from service.features.pictures.camera_calibration import CameraCalibration
-    from service.identify.blind.solver import BlindSolver
     from service.settings import Settings
-    from service.sky.whole_sky.bright_stars import BrightStars
 
 
 def add(commands: Any) -> None:
@@ -43,7 +43,7 @@ def run(parsed: Namespace) -> int:
     acquire camera calibrate pictures/*.jpg -o missions/mycam.toml
     acquire camera calibrate a.png b.png c.png --fov 12 --name MYCAM -o mycam.toml
     """
-    from service.acquire.picture import blind_sky
+    from service.features.pictures.blind.picture import blind_sky
     from service.features.pictures.camera_calibration import calibrate_camera
     from service.sky.catalog.star_catalog import open_catalog
 
@@ -70,7 +70,7 @@ def _solved(
     parsed: Namespace, settings: "Settings", sky: "BrightStars", solver: "BlindSolver"
 ) -> list["PictureResult"]:
     """Solve the pictures; reports those without an attitude or mirrored, and returns the others."""
-    from service.acquire.picture import solve_picture
+    from service.features.pictures.blind.picture import solve_picture
 
     read = picture_reader(parsed.dark, settings)
     used: list[PictureResult] = []
@@ -118,7 +118,7 @@ def _write_mission(output: Path, name: str, found: "CameraCalibration") -> None:
 
 def _write_maps(output: Path, found: "CameraCalibration") -> list[Path]:
     """Draw the residuals before and after calibration as PNG files next to the mission file."""
-    from service.imaging.overlay import draw_residuals
+    from service.features.pictures.tracker.overlay import draw_residuals
 
     size, usual_px = (found.lens.width_px, found.lens.height_px), max(found.rms_px[1], 1e-3)
     # The first map has all stars, the second one only those used in the fit.

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from service.acquire.picture import PictureResult
-from service.identify.blind.lens import (
+from service.features.pictures.blind.lens import (
     BEND_PRIOR,
     CENTER_PRIOR,
     PARAMETERS,
@@ -15,7 +14,8 @@ from service.identify.blind.lens import (
     lens_of,
     linearised,
 )
-from service.identify.blind.verify import LEAST_SIGMA_PX
+from service.features.pictures.blind.picture import PictureResult
+from service.features.pictures.blind.verify import LEAST_SIGMA_PX
 from service.vectors import Matrix, Vector, rotate_about
 
 ROUNDS = 15

@@ -1,11 +1,12 @@
-"""`acquire frame` without a spacecraft, and `acquire camera`."""
+"""Commands `acquire frame`, `acquire camera` and `acquire simulate frames`."""
 
 from typing import Any
 
-from service.features.pictures import any_camera, camera
+from service.features.pictures import camera, frame_command, simulate_command
 
 
 def add(commands: Any) -> None:
-    """Extend `acquire frame` for pictures of any camera, and declare `acquire camera`."""
-    any_camera.extend(commands.choices["frame"])
+    """Declare the commands for frames and pictures."""
+    frame_command.add(commands)
     camera.add(commands)
+    simulate_command.add(commands)

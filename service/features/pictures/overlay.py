@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from service.acquire.picture import PictureAttitude, PictureResult
+from service.features.pictures.blind.picture import PictureAttitude, PictureResult
 from service.vectors import Vector, from_ra_dec
 
 MOST_SIDE_PX, LEAST_SIDE_PX = 1600, 800

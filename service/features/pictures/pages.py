@@ -1,8 +1,19 @@
-"""Console page that solves pictures of any camera."""
+"""Console page that solves pictures of any camera, and the frame on the page of its batch."""
+
+from collections.abc import Iterator
 
 from starlette.responses import Response
 
-from service.web.console.page import HEADERS, ContextDep, FromQuery, PageQuery, console_page
+from service.contract.answers import Answer, Result
+from service.web.console.page import (
+    HEADERS,
+    ContextDep,
+    FromQuery,
+    PageContext,
+    PageQuery,
+    Panel,
+    console_page,
+)
 from service.web.requests.access import Policy
 
 # The script shows the drawn picture, which no address of the service has.
@@ -28,3 +39,14 @@ def pictures_page(query: FromQuery[PageQuery], context: ContextDep) -> Response:
     )
     page.headers["Content-Security-Policy"] = _POLICY
     return page
+
+
+def frame_of_batch(context: PageContext, record: Result, tried: Answer | None) -> Iterator[Panel]:
+    """Panel with the frame that a batch was made from, if it was."""
+    if record.frame:
+        answer = record.answer
+        values = {"id": answer.id, "observed": answer.counts.observed, "is_what_if": bool(tried)}
+        yield Panel("_frame_of_batch.html.jinja", values)
+
+
+PANELS = {"batch_page": frame_of_batch}

@@ -1,4 +1,4 @@
-"""Pictures of any camera, solved one at a time without a record."""
+"""The part of the app for frames of spacecraft and pictures of any camera."""
 
 import base64
 import dataclasses
@@ -10,9 +10,10 @@ from msgspec.structs import replace
 
 from service.app.factory import App
 from service.errors import Busy
+from service.features.pictures.frames.files import read_frame
+from service.features.pictures.frames.frame import FrameLimits
 from service.features.pictures.records import Picture, picture_of
-from service.imaging.frames.files import read_frame
-from service.imaging.frames.frame import FrameLimits
+from service.features.pictures.tracker.part import Frames
 from service.missions.mission import mission_named
 from service.vectors import Projection
 
@@ -22,10 +23,14 @@ _COMMAND_OPTION = re.compile(r" \(--[^)]*\)")
 
 
 class Pictures:
-    """Finds attitude, lens and stars of pictures, which are not recorded."""
+    """Takes frames of spacecraft; finds attitude, lens and stars of pictures, and records nothing.
+
+    `frames` submits frames and draws recorded ones.
+    """
 
     def __init__(self, app: App) -> None:
         self._app = app
+        self.frames = Frames(app.context, app.submissions)
         self._turn = threading.BoundedSemaphore(1)
 
     def close(self) -> None:
@@ -51,8 +56,12 @@ class Pictures:
         """
         self._app.submissions.require_kernels()
         # Imported here, since the import takes a third of the service's starting time.
-        from service.acquire.picture import blind_sky, focal_px_of_field, solve_picture
-        from service.acquire.picture_remarks import doubt_of_exposure
+        from service.features.pictures.blind.picture import (
+            blind_sky,
+            focal_px_of_field,
+            solve_picture,
+        )
+        from service.features.pictures.blind.picture_remarks import doubt_of_exposure
         from service.features.pictures.overlay import overlay_of
 
         with file:

@@ -8,7 +8,7 @@ from service.observations.frame_record import rounded_counts
 from service.vectors import Projection
 
 if TYPE_CHECKING:
-    from service.acquire.picture import PictureAttitude, PictureResult
+    from service.features.pictures.blind.picture import PictureAttitude, PictureResult
 
 
 class PictureAttitudeFound(Record, frozen=True, kw_only=True):

@@ -1,4 +1,4 @@
-"""API route that solves pictures of any camera."""
+"""API routes for frames of star trackers, and the one that solves pictures of any camera."""
 
 from typing import IO, Annotated
 
@@ -9,14 +9,16 @@ from starlette.responses import Response
 
 from service.features.pictures.part import Pictures
 from service.features.pictures.records import Picture
+from service.features.pictures.tracker.routes import overlay_router
+from service.features.pictures.tracker.routes import router as frames_router
+from service.features.pictures.upload import FRAMES, frame_body
 from service.vectors import Projection
 from service.web.openapi import ApiRouter, ClientMethod, Returns
 from service.web.requests.access import AppDep, CallerDep, Policy, json_response
 from service.web.requests.query_parameters import FromQuery, Query
-from service.web.requests.request_body import frame_body
 
 router = ApiRouter("frames")
-ROUTERS = (router,)
+ROUTERS = (frames_router, overlay_router, router)
 
 
 class PictureQuery(Query):
@@ -55,7 +57,7 @@ class PictureQuery(Query):
 
 
 async def _picture(request: Request, query: FromQuery[PictureQuery], app: AppDep) -> IO[bytes]:
-    return await frame_body(request, app.settings.frame_mb << 20)
+    return await frame_body(request, app.settings)
 
 
 @ClientMethod("solve_picture", body="picture", repeatable=True)
@@ -64,7 +66,7 @@ async def _picture(request: Request, query: FromQuery[PictureQuery], app: AppDep
     # It records nothing; the handler asks for access to the spacecraft that is named.
     Policy("read", "nothing"),
     Returns("Attitude, lens and stars of the picture. The service records none of it.", Picture),
-    frame=True,
+    files=FRAMES,
     problems=(404, 503),
 )
 def solve_picture(

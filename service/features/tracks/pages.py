@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from service.contract.answers import Answer
+from service.contract.answers import Answer, Result
 from service.features.tracks.part import Tracks
 from service.storage.queries.period import PeriodStars
 from service.web.console.page import PageContext, Panel
@@ -29,13 +29,14 @@ def tracks_of_period(
     yield Panel("_tracks_of_period.html.jinja", values)
 
 
-def tracks_of_batch(context: PageContext, id: str, answer: Answer) -> Iterator[Panel]:
+def tracks_of_batch(context: PageContext, record: Result, tried: Answer | None) -> Iterator[Panel]:
     """Panel with the tracks through the unmatched stars of a result, if there are any."""
+    answer = record.answer
     if answer.attitude is None or not answer.counts.unmatched:
         return
-    tracks = context.app.part(Tracks).through_batch(id, answer.spacecraft, answer.run)
+    tracks = context.app.part(Tracks).through_batch(answer.id, answer.spacecraft, answer.run)
     if tracks.items:
-        yield Panel("_tracks_of_batch.html.jinja", {"id": id, "tracks": tracks})
+        yield Panel("_tracks_of_batch.html.jinja", {"id": answer.id, "tracks": tracks})
 
 
 PANELS = {"period_page": tracks_of_period, "batch_page": tracks_of_batch}

@@ -200,35 +200,6 @@ def _frame_of(row: Any) -> answers.FrameWithStars:
     return msgspec.convert(fields, answers.FrameWithStars)
 
 
-def frame_of_result(connection: Connection, id: str) -> Row:
-    """Data for the overlay on a result's frame; raises `NotFound`, also without a frame.
-
-    The `settings` are those of the mission at the time of the result.
-    """
-    read_result(connection, id)
-    query = (
-        select(
-            results.c.answer,
-            results.c.catalog_digest,
-            batches.c.input,
-            tables.frames.c.detections,
-            tables.frames.c.preview,
-            tables.frames.c.preview_step,
-            tables.missions.c.settings,
-        )
-        .select_from(
-            results.join(batches, results.c.batch_id == batches.c.id)
-            .join(tables.frames, tables.frames.c.batch_id == batches.c.id)
-            .join(tables.missions, tables.missions.c.digest == results.c.mission_digest)
-        )
-        .where(results.c.id == id)
-    )
-    row = connection.execute(query).mappings().first()
-    if row is None:
-        raise NotFound(f"batch {shown_value(id)} was not made of a frame")
-    return dict(row)
-
-
 def summary_query() -> Select[Any]:
     """SQL query for the columns that `summary_of` reads."""
     kept = [column for column in results.c if column.name not in ("answer", "spacecraft", "run")]

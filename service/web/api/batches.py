@@ -40,7 +40,6 @@ from service.web.requests.access import (
 from service.web.requests.problems import problem_within
 from service.web.requests.query_parameters import FromQuery, PeriodPageQuery, SpacecraftPath, Who
 from service.web.requests.request_body import (
-    BINARY,
     JSON,
     NO_IDEMPOTENCY_KEY,
     NO_KEY_OF_A_BLOCK,
@@ -54,8 +53,6 @@ from service.web.requests.request_body import (
 )
 
 router = ApiRouter("batches")
-
-PNG = "image/png"
 
 ResultId = Annotated[str, Path(description="The `id` of a recorded result.")]
 
@@ -172,21 +169,6 @@ def list_batches(request: Request, query: FromQuery[params.BatchQuery], app: App
 def get_batch(id: ResultId, app: AppDep) -> Response:
     """One recorded result with its batch."""
     return json_response(app.results.get(id))
-
-
-@router.serves(
-    "GET /batches/{id}/overlay",
-    Policy("read", "result"),
-    Returns("The image.", media_type=PNG, also=BINARY),
-)
-def get_overlay(request: Request, id: ResultId, app: AppDep) -> Response:
-    """An image of a frame's result: the stars, their names, and residual arrows.
-
-    The PNG is sent as `application/octet-stream` if `Accept` asks for that type.
-    """
-    # Generated clients know no media type of pictures.
-    media_type = BINARY if BINARY in request.headers.get("accept", "").lower() else PNG
-    return Response(app.frames.overlay(id), media_type=media_type, headers={"Vary": "Accept"})
 
 
 @router.serves(

@@ -28,12 +28,6 @@ from service.web.requests.problems import NotJson
 
 JSON = "application/json"
 BINARY = "application/octet-stream"
-FRAMES = (
-    BINARY,
-    *("application/fits", "image/fits", "image/tiff", "image/png", "image/jpeg"),
-    "application/x-npy",
-)
-"""Media types of frames; the first bytes determine the format."""
 
 MAX_JSON_BYTES = 2 << 20
 """Greatest size of a JSON body, enough for ten thousand stars, so that the error names them."""
@@ -58,7 +52,7 @@ class BodyLimits:
     """Longest wait in seconds for the next piece of a body."""
     json_s: float = 60.0
     replay_s: float = 3600.0
-    frame_s: float = 120.0
+    file_s: float = 120.0
 
 
 DEFAULT_LIMITS = BodyLimits()
@@ -243,14 +237,14 @@ async def telemetry_body(
     return Spooled(file, coding, lines + (last != b"\n") if coding == "identity" else None)
 
 
-async def frame_body(request: Request, max_bytes: int) -> IO[bytes]:
-    """Read a frame into a rewound temporary file that is deleted when closed."""
-    _require_type(request, FRAMES)
+async def file_body(request: Request, types: tuple[str, ...], max_bytes: int) -> IO[bytes]:
+    """Read a file of some media types into a rewound temporary file that is deleted when closed."""
+    _require_type(request, types)
     _coding(request, ("identity",))
     limits: BodyLimits = request.app.state.limits
     file = tempfile.TemporaryFile()  # noqa: SIM115 - its reader closes it
     try:
-        async for piece in _pieces(request, max_bytes, limits.pause_s, limits.frame_s):
+        async for piece in _pieces(request, max_bytes, limits.pause_s, limits.file_s):
             file.write(piece)
     except BaseException:
         file.close()

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from service.acquire.picture import blind_sky
-from service.identify.blind.lens import Lens
-from service.identify.blind.solver import focal_px_of
+from service.features.pictures.blind.lens import Lens
+from service.features.pictures.blind.picture import blind_sky
+from service.features.pictures.blind.solver import focal_px_of
 from service.sky.catalog.star_catalog import load_embedded
 from tests.features.pictures.drawn import draw_picture
-from tests.web.test_frames import frames, send
+from tests.features.pictures.test_frames_over_http import frames, send
 
 __all__ = ["frames", "send"]
 

@@ -9,9 +9,9 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 from scipy.special import erf
 
-from service.identify.blind.lens import Lens
-from service.identify.blind.solver import rotation_between
-from service.sky.whole_sky.bright_stars import BrightStars
+from service.features.pictures.blind.bright_stars import BrightStars
+from service.features.pictures.blind.lens import Lens
+from service.features.pictures.blind.solver import rotation_between
 from service.vectors import Matrix
 
 SIZES = ((1024, 768), (640, 480), (1280, 960), (1024, 1024))

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from service.acquire.frame_submission import submit_frame
-from service.acquire.picture import solve_picture
 from service.cli import main
 from service.errors import BadBatch, BadConfiguration
+from service.features.pictures.blind.lens import Lens
+from service.features.pictures.blind.picture import solve_picture
+from service.features.pictures.blind.solver import rotation_between
 from service.features.pictures.camera_calibration import calibrate_camera
-from service.identify.blind.lens import Lens
-from service.identify.blind.solver import rotation_between
-from service.imaging.frames.frame import Frame
-from service.imaging.submit import FrameIn
+from service.features.pictures.frames.frame import Frame
+from service.features.pictures.tracker.frame_submission import submit_frame
+from service.features.pictures.tracker.submit import FrameIn
 from service.missions.mission import parse_mission, read_mission
 from service.sky.catalog.star_catalog import load_embedded
 from service.vectors import attitude_error_arcsec, matrix_from_quaternion

@@ -7,11 +7,11 @@ import pytest
 from astropy.io import fits
 from PIL import Image
 
-from service.acquire.picture import solve_picture
+from service.features.pictures.blind.picture import solve_picture
+from service.features.pictures.detection.points import find_points
+from service.features.pictures.frames.files import read_frame
+from service.features.pictures.frames.frame import Frame, FrameLimits
 from service.features.pictures.overlay import overlay_of
-from service.imaging.detection.points import find_points
-from service.imaging.frames.files import read_frame
-from service.imaging.frames.frame import Frame, FrameLimits
 from service.vectors import attitude_error_arcsec
 from tests.features.pictures.drawn import middle_attitude
 

@@ -14,12 +14,12 @@ from astropy.io import fits
 from PIL import Image
 
 from service.cli import main
+from service.features.pictures.tracker.simulated import frame_bytes
 from service.missions.mission import load_missions
-from service.simulate.frames import frame_bytes
 from service.vectors import matrix_from_quaternion
-from tests.imaging.hostile_headers import absurd_files, good_files, with_absurd_header
+from tests.features.pictures.hostile_headers import absurd_files, good_files, with_absurd_header
+from tests.features.pictures.test_frames_over_http import URL
 from tests.scale import draws, size, some_in_a_sitting
-from tests.web.test_frames import URL
 
 PLEIADES = Path(__file__).with_name("cedarsolve-pleiades.jpg")
 OCTETS = {"Content-Type": "application/octet-stream"}

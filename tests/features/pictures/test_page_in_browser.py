@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from service.features.pictures.tracker.simulated import FrameSettings, draw_frames, frame_bytes
 from service.missions.mission import load_missions
-from service.simulate.frames import FrameSettings, draw_frames, frame_bytes
 from tests.features.pictures.test_over_http import PLEIADES
 from tests.web.browser import CHROMIUM
 from tests.web.fitting import faults

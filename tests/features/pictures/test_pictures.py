@@ -9,16 +9,16 @@ import pytest
 from PIL import Image
 from scipy.stats import chi2
 
-from service.acquire.picture import MOST_SIGMA_SHARE, solve_picture
 from service.cli import main
 from service.errors import BadFile
+from service.features.pictures.blind.lens import Lens
+from service.features.pictures.blind.picture import MOST_SIGMA_SHARE, solve_picture
+from service.features.pictures.blind.solver import FocalRange, focal_px_of
+from service.features.pictures.blind.verify import Points
+from service.features.pictures.detection.points import find_points
+from service.features.pictures.frames.files import read_frame
+from service.features.pictures.frames.frame import Frame, FrameLimits
 from service.features.pictures.overlay import overlay_of
-from service.identify.blind.lens import Lens
-from service.identify.blind.solver import FocalRange, focal_px_of
-from service.identify.blind.verify import Points
-from service.imaging.detection.points import find_points
-from service.imaging.frames.files import read_frame
-from service.imaging.frames.frame import Frame, FrameLimits
 from service.vectors import ARCSEC_PER_RADIAN, attitude_error_arcsec
 from tests.features.pictures.drawn import draw_picture, jpeg_of, middle_attitude
 from tests.scale import draws

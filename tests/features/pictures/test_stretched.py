@@ -7,12 +7,12 @@ import pytest
 from PIL import Image
 from scipy.stats import chi2
 
-from service.acquire.picture import solve_picture
-from service.identify.blind.lens import Lens
-from service.identify.blind.solver import focal_px_of
-from service.imaging.detection.clipped import clipped_stars
-from service.imaging.detection.points import find_points, without_dark
-from service.imaging.frames.frame import Frame
+from service.features.pictures.blind.lens import Lens
+from service.features.pictures.blind.picture import solve_picture
+from service.features.pictures.blind.solver import focal_px_of
+from service.features.pictures.detection.clipped import clipped_stars
+from service.features.pictures.detection.points import find_points, without_dark
+from service.features.pictures.frames.frame import Frame
 from service.vectors import ARCSEC_PER_RADIAN, attitude_error_arcsec
 from tests.features.pictures.drawn import draw_picture, jpeg_of, middle_attitude
 from tests.scale import draws

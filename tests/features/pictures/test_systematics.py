@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.identify.blind.lens import (
+from service.features.pictures.blind.lens import (
     PARAMETERS,
     Lens,
     fit_lens,

@@ -7,12 +7,12 @@ import pytest
 from astropy.io import fits
 from scipy.spatial import cKDTree
 
-from service.acquire.picture import solve_picture
-from service.identify.blind.lens import Lens
-from service.identify.blind.solver import focal_px_of
-from service.imaging.detection.points import find_points
-from service.imaging.frames.files import read_frame
-from service.imaging.frames.frame import FrameLimits
+from service.features.pictures.blind.lens import Lens
+from service.features.pictures.blind.picture import solve_picture
+from service.features.pictures.blind.solver import focal_px_of
+from service.features.pictures.detection.points import find_points
+from service.features.pictures.frames.files import read_frame
+from service.features.pictures.frames.frame import FrameLimits
 from service.vectors import ARCSEC_PER_RADIAN, attitude_error_arcsec
 from tests.features.pictures.drawn import middle_attitude
 from tests.features.pictures.trailed import draw_trailed

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.acquire.picture import solve_picture
 from service.cli import main
-from service.identify.blind.lens import PARAMETERS, PROJECTIONS, Lens, lens_of, linearised
-from service.identify.blind.solver import focal_px_of
-from service.imaging.frames.files import read_frame
-from service.imaging.frames.fits import write_fits
-from service.imaging.frames.frame import Frame, FrameLimits
+from service.features.pictures.blind.lens import PARAMETERS, PROJECTIONS, Lens, lens_of, linearised
+from service.features.pictures.blind.picture import solve_picture
+from service.features.pictures.blind.solver import focal_px_of
+from service.features.pictures.frames.files import read_frame
+from service.features.pictures.frames.fits import write_fits
+from service.features.pictures.frames.frame import Frame, FrameLimits
 from service.vectors import attitude_error_arcsec, rotate_about
 from tests.features.pictures.trailed import add_path
 from tests.scale import draws

@@ -7,8 +7,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import erf
 
-from service.identify.blind.lens import Lens
-from service.sky.whole_sky.bright_stars import BrightStars
+from service.features.pictures.blind.bright_stars import BrightStars
+from service.features.pictures.blind.lens import Lens
 from service.vectors import Matrix
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.errors import BadInput
-from service.imaging.centroids.psf import GaussianPsf
+from service.features.pictures.centroids.psf import GaussianPsf
 from service.vectors import ARCSEC_PER_RADIAN
 from studies.star_image_report.correlate import (
     displacement_by_derivative,
@@ -20,7 +20,7 @@ from studies.star_image_report.correlate import (
 )
 from studies.star_image_report.transfer import PointImage, image_by_fft
 from studies.star_image_report.wires import INCH_M, filtered
-from tests.imaging.optics import DIAMETER_M, LASER_M
+from tests.features.pictures.optics import DIAMETER_M, LASER_M
 
 GRID = np.arange(-40.0, 41.0)
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from service.imaging.centroids.sequential import diffuse
+from service.features.pictures.centroids.sequential import diffuse
 from studies.star_image_report.correlate import (
     FIELD,
     SIGMA_PX,

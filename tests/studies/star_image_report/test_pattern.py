@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis.extra.numpy import arrays
 
-from service.imaging.centroids.psf import GaussianPsf
+from service.features.pictures.centroids.psf import GaussianPsf
 from service.vectors import rotate_about, unit
 from studies.star_image_report.recognising import (
     chord_constant,

@@ -8,7 +8,7 @@ import pytest
 from scipy.special import j1
 
 from service.errors import BadInput
-from service.imaging.optics import Pupil, Spectrum, disc, image_at, thermal
+from service.features.pictures.centroids.optics import Pupil, Spectrum, disc, image_at, thermal
 from studies.star_image_report.optics import (
     airy,
     disc_autocorrelation,
@@ -30,7 +30,7 @@ from studies.star_image_report.transfer import (
     mean_wavelength_m,
     monochromatic,
 )
-from tests.imaging.optics import DIAMETER_M, LASER_M
+from tests.features.pictures.optics import DIAMETER_M, LASER_M
 
 RADIUS_M = DIAMETER_M / 2.0
 

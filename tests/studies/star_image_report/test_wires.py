@@ -14,7 +14,7 @@ from studies.star_image_report.wires import (
     shares_of_light,
     tail,
 )
-from tests.imaging.optics import DIAMETER_M, LASER_M, MESH
+from tests.features.pictures.optics import DIAMETER_M, LASER_M, MESH
 
 THIN_M, THICK_M = 0.00443 * INCH_M, 0.00663 * INCH_M
 
@@ -47,7 +47,7 @@ def test_equation_4_1_gives_the_orders_to_the_roundness_of_the_aperture(screen):
 
 def test_the_constant_of_4_1_makes_it_the_light_of_a_square_of_openings():
     """s^4 / lambda² and N^4: by the transform of 5 x 5 openings, in all directions."""
-    from service.imaging.optics import Pupil, centres, image_at
+    from service.features.pictures.centroids.optics import Pupil, centres, image_at
     from studies.star_image_report.transfer import between_wires
 
     cell = MESH.pitch_m / 100

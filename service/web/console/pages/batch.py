@@ -152,7 +152,7 @@ def batch_page(request: Request, id: ResultId, context: ContextDep) -> Response:
         putting_back=_putting_back(context, record),
         pointing=_pointing(shown),
         timings_us=structs.asdict(shown.timings_us),
-        panels=context.panels("batch_page", id, answer),
+        panels=context.panels("batch_page", record, tried),
         around=context.app.results.neighbours(id),
         other_settings=mission.digest != answer.provenance.mission,
     )

@@ -1,0 +1,1 @@
+"""Blind solution: attitude, lens and stars of a picture without any prior knowledge."""

@@ -1,0 +1,1 @@
+"""Frames of star trackers: submission, record, simulation."""

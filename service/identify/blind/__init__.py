@@ -1,1 +1,0 @@
-"""Blind solver: attitude and lens of a picture without any prior knowledge."""

@@ -1,1 +1,0 @@
-"""Image processing for star cameras: images of point sources, centroids, frames."""
