@@ -13,7 +13,7 @@ from service.ephemerides.rows import SAME_MOMENT_NS, Integers
 from service.errors import BadFile, Fault
 from service.interpolation import QUARTER_TURN_RAD, steps_between
 from service.times import Utc
-from service.vectors import Vector, rotation_vectors
+from service.vectors import Vector, rotation_vectors, turned_quaternion
 
 MOST_RECORDS = 5_000_000
 """Greatest number of attitudes held in memory, 40 bytes each, or 64 with rates."""
@@ -146,9 +146,10 @@ def known_attitudes(file: str, object_name: str, segments: Sequence[Segment]) ->
 def _require_no_fill(file: str, segment: Segment) -> None:
     """Raise `BadFile` for records of the identity that stand for no attitude.
 
-    The body would have to jump there, or away, much faster than it turns beside these records.
+    The body would have to jump there, or away, much faster than it turns beside these records, and
+    no rates lead there.
     """
-    q, times = segment.quaternion, segment.time_ns
+    q, times, rate = segment.quaternion, segment.time_ns, segment.rate_rad_s
     is_identity = ~q[:, :3].any(axis=1)
     others = np.flatnonzero(~is_identity)
     if len(others) < 2:
@@ -166,17 +167,30 @@ def _require_no_fill(file: str, segment: Segment) -> None:
             * abs((times[row] - times[near]) / (times[near] - times[far]))
             for near, far in sides
         ]
+        if rate is not None and any(
+            _angle_rad(q[row], _carried(q[near], rate[[near, row]], times[row] - times[near]))
+            < FILL_RAD
+            for near, _ in sides
+        ):
+            continue
         if sides and all(j > max(FILL_RAD, 2.0 * o) for j, o in zip(jumps, own, strict=True)):
             jump_deg = np.degrees(min(jumps))
             message = f"is the identity, {jump_deg:.3g} degrees from its neighbours: no attitude?"
             raise BadFile(Fault(f"{file}, {segment.place}, record {row + 1}", message))
 
 
+def _carried(q: Vector, rates_rad_s: Vector, passed_ns: int) -> Vector:
+    """An attitude (4,) carried on by the mean of rates (2, 3)."""
+    turn = rates_rad_s.mean(axis=0) * (passed_ns * 1e-9)
+    return np.asarray(turned_quaternion(q[None], turn[None])[0])
+
+
 def _require_own_rates(file: str, segment: Segment) -> None:
     """Raise `BadFile` for rates that fit the attitudes in another sign or unit only.
 
-    Steps of more than a quarter turn, which a body may make either way, are left to the
-    interpolation, as are rates that fit in no way.
+    So it does for attitudes that are repeated while the rates turn the body, as where telemetry
+    stands still. Steps of more than a quarter turn, which a body may make either way, are left to
+    the interpolation, as are rates that fit in no way.
     """
     q, rate = segment.quaternion, segment.rate_rad_s
     if rate is None or segment.discrete:
@@ -186,6 +200,11 @@ def _require_own_rates(file: str, segment: Segment) -> None:
     by_steps, by_rates, missed = (np.linalg.norm(v, axis=1) for v in (turned, told, turned - told))
     larger = np.maximum(by_steps, by_rates)
     near = larger <= QUARTER_TURN_RAD
+    stands = near & (q[1:] == q[:-1]).all(axis=1) & (by_rates > MISSED_RAD)
+    if 0 < np.count_nonzero(stands) < 0.5 * np.count_nonzero(near):
+        record = int(np.flatnonzero(stands)[0]) + 2
+        message = "repeats the attitude before it, from which its rates turn the body"
+        raise BadFile(Fault(f"{file}, {segment.place}, record {record}", message))
     wrong = near & (missed > np.maximum(MISSED_RAD, MISSED_SHARE * larger))
     count, steps = int(wrong.sum()), int(near.sum())
     if steps < FEWEST_STEPS or 2 * count <= steps:

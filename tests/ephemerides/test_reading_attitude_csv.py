@@ -55,17 +55,35 @@ def test_rates_of_a_row_tell_how_often_the_body_turned(tmp_path):
 )
 def test_rates_that_lead_elsewhere_than_the_attitudes_are_refused(rate, words, tmp_path):
     """Half a degree a second and ten seconds: neither way round is in doubt."""
-    cells = [
-        f"1996-01-10T12:{k // 6:02d}:{10 * k % 60:02d}Z,"
-        + ",".join(map(repr, (*about_z(5.0 * k).tolist(), 0.0, 0.0, float(rate))))
-        for k in range(7)
-    ]
-    text = "\n".join([ROWS.splitlines()[0], *cells])
+    text = rows_of(5.0 * np.arange(7), rate)
     if words is None:
         assert len(read(text, tmp_path)) == 7
         return
     with pytest.raises(BadFile, match=f"line 2, rates: do not lead from one .* {words}"):
         read(text, tmp_path)
+
+
+def rows_of(angles_deg, rate):
+    """CSV rows each ten seconds, turned about z, with one rate in deg/s."""
+    cells = [
+        f"1996-01-10T12:{k // 6:02d}:{10 * k % 60:02d}Z,"
+        + ",".join(map(repr, (*about_z(angle).tolist(), 0.0, 0.0, float(rate))))
+        for k, angle in enumerate(angles_deg)
+    ]
+    return "\n".join([ROWS.splitlines()[0], *cells])
+
+
+def test_attitudes_that_stand_still_while_the_rates_turn_are_refused(tmp_path):
+    with pytest.raises(BadFile, match="record 4: repeats the attitude before it"):
+        read(rows_of([0.0, 5.0, 10.0, 10.0, 20.0, 25.0, 30.0], 0.5), tmp_path)
+    assert len(read(rows_of([30.0] * 7, 0.0), tmp_path)) == 7
+
+
+def test_the_identity_is_an_attitude_where_the_rates_lead_there(tmp_path):
+    """Half a turn a step: every second record is the identity."""
+    known = read(rows_of([0.0, 180.0, 360.0, 180.0, 0.0, 180.0], 18.0), tmp_path)
+    start = known.segments[0].time_ns[:1]
+    assert off_deg(known.at(start + 5 * 10**9)[0], about_z(90.0)) < 1e-6
 
 
 @pytest.mark.parametrize("text", [SPUN, V2], ids=["csv", "aem"])
