@@ -165,10 +165,11 @@ def check(parsed: Namespace) -> int:
 
 
 ESTIMATE_NOTES = """\
-NCAP is counted, NTOT predicted: NTOT = k_g (NCAP^2 - NCAP) / 2 with the k_g of the place and
-the shape of the zone. "counted" is the most NTOT that a zone anywhere in the sky holds. The bound
-is that of Fink & Shoup (1994): k_g of the areas (equation 2) in equation 1, with the most stars of
-any zone. It is a bound for stars spread evenly; the text names the zones that exceed it.
+Stars are counted, pairs predicted: all pairs of the zone's stars times the share of them that are
+no farther apart than the largest separation, by place and shape of the zone. "counted" is the most
+pairs that a zone anywhere in the sky holds. The bound is that of Fink & Shoup (1994), equation 1:
+the share of the areas (k_g, equation 2) of all pairs of the most stars that any zone has. It is a
+bound for stars spread evenly; the text names the zones that exceed it.
 Memory is that of the largest zone as the service caches it, grown by the zone's grid."""
 
 
@@ -183,14 +184,14 @@ def add_estimate(group: Any) -> None:
         type=float,
         nargs="+",
         metavar="DEG",
-        help="radius of a cap (CCAP), half width of a band (WBAND); default: the mission's",
+        help="radius of a cap, half width of a band; default: the mission's",
     )
     parser.add_argument(
         "--pair-separation-max",
         type=float,
         nargs="+",
         metavar="DEG",
-        help="HMAX; default: the mission's",
+        help="largest separation of a pair; default: the mission's",
     )
     parser.add_argument(
         "--magnitude-limit",
@@ -279,8 +280,8 @@ def _text(mission: "Mission", epoch_year: float, found: "list[ZoneEstimate]") ->
     from service.sky.geometry.pairs import MAX_PAIRS
 
     header = (
-        *("zone", "HMAX", "to mag", "NCAP least", "median", "most", "NTOT least", "median"),
-        *("most", "counted", "k_g", "k_g, areas", "bound", "memory, most"),
+        *("zone", "separation", "to mag", "stars, least", "median", "most", "pairs, least"),
+        *("median", "most", "counted", "share", "of areas", "bound", "memory, most"),
     )
     rows = [tuple(_cells(each).values()) for each in found]
     lines = [
@@ -292,7 +293,7 @@ def _text(mission: "Mission", epoch_year: float, found: "list[ZoneEstimate]") ->
         f"{each.of} about RA {each.richest_deg[0]:.2f}, Dec {each.richest_deg[1]:+.2f} deg"
         for each in found
     )
-    lines += ["counted: NTOT of the richest zone: " + "; ".join(richest)]
+    lines += ["counted: pairs of the richest zone: " + "; ".join(richest)]
     exceeding = dict.fromkeys(each.of for each in found if each.pairs_counted > each.pairs_bound)
     if exceeding:
         lines.append(f"counted exceeds the bound: {'; '.join(exceeding)}")
