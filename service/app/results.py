@@ -3,7 +3,7 @@
 import json
 import math
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 
@@ -39,7 +39,7 @@ from service.storage.queries.results import (
 from service.storage.queries.star_field import StarField, star_field_of, tracker_comparison
 from service.storage.queries.time_buckets import BucketFilter
 from service.storage.recording.ids import is_ulid
-from service.storage.recording.signatures import signature_of
+from service.storage.recording.signatures import signatures_of
 from service.storage.recording.unsaved_result import Answered
 from service.storage.sql.columns import Row
 from service.times import Utc, utc_now
@@ -61,17 +61,22 @@ class Results:
             current = None if record.current else results.current_of(connection, id)
         if record.parent is None and current is None:
             return record
-        with self._context.reading() as connection:
-            if record.parent is not None:
-                signature = signature_of(connection, record.parent, id)
-                record = structs.replace(record, signature=signature)
-            if current is not None and current.parent_id is not None:
-                replaced_by = Replacement(
-                    result=current.id,
-                    signature=signature_of(connection, current.parent_id, current.id),
-                )
-                record = structs.replace(record, replaced_by=replaced_by)
+        replacing = {} if current is None else {current.id: current.parent_id}
+        signatures = self.signatures({id: record.parent} | replacing)
+        if record.parent is not None:
+            record = structs.replace(record, signature=signatures.get(id))
+        if current is not None and current.parent_id is not None:
+            replaced_by = Replacement(result=current.id, signature=signatures.get(current.id))
+            record = structs.replace(record, replaced_by=replaced_by)
         return record
+
+    def signatures(self, parents: Mapping[str, str | None]) -> dict[str, Signature]:
+        """Signatures on what-ifs by id, from the ids of their parents; see `signatures_of`."""
+        what_ifs = {id: parent for id, parent in parents.items() if parent is not None}
+        if not what_ifs:
+            return {}
+        with self._context.reading() as connection:
+            return signatures_of(connection, what_ifs)
 
     def adopted(
         self, spacecraft: str, run: str, start: Utc, end: Utc
@@ -83,9 +88,8 @@ class Results:
         selected = ResultFilter(run, spacecraft, start, end)
         with self._context.reading() as connection:
             found = results.adopted_what_ifs(connection, selected, MOST_ADOPTED)
-            return [
-                (each, signature_of(connection, each["parent_id"], each["id"])) for each in found
-            ]
+        signatures = self.signatures({each["id"]: each["parent_id"] for each in found})
+        return [(each, signatures.get(each["id"])) for each in found]
 
     def latest(self, spacecraft: str, run: str | None = None) -> Result:
         """Read the newest current result of a spacecraft in a run, by batch time, as `get` does.
@@ -111,6 +115,7 @@ class Results:
         outcome: OutcomeName | None = None,
         status: StatusName | None = None,
         batch: str | None = None,
+        adopted: bool = False,
         limit: int = 100,
         cursor: str | None = None,
     ) -> Page[Summary]:
@@ -129,6 +134,7 @@ class Results:
                 outcome=outcome,
                 status=status,
                 batch=batch,
+                adopted=adopted,
                 limit=limit,
                 cursor=cursor,
             )

@@ -368,7 +368,10 @@ class Summary(Record, frozen=True, kw_only=True):
     status: Annotated[Status | None, doc("Status of the attitude; null without an attitude.")]
     reason: Reason | None
     measures: Measures
-    parent: Annotated[Id | None, doc("The result that a what-if started from.")]
+    parent: Annotated[
+        Id | None,
+        doc("The result that a what-if started from; a current result with one is adopted."),
+    ]
     current: Annotated[bool, doc("True if this is the current result of its batch.")]
     archived: Annotated[bool, doc("True if it is read from the archive, which takes longer.")]
 

@@ -186,7 +186,10 @@ def test_an_adopted_what_if_becomes_current_and_both_are_kept(post, batch, run, 
     adopted = what_if(client, id, **OTHER, adopt=True).json()["id"]
     assert client.get(f"{URL}/{id}").json()["current"] is False
     assert client.get(f"{URL}/{adopted}").json()["current"] is True
+    other = post(batch | {"run": run, "batch": "other"}).json()["id"]
     listed = client.get(URL, params={"run": run}).json()["items"]
+    assert {each["id"]: each["parent"] for each in listed} == {adopted: id, other: None}
+    listed = client.get(URL, params={"run": run, "adopted": True}).json()["items"]
     assert [each["id"] for each in listed] == [adopted]
 
 

@@ -359,6 +359,11 @@ def test_an_adopted_result_says_who_adopted_it_and_why(client, post, batch, run)
     page = client.get(f"/batches/{first['id']}")
     assert f'href="/batches/{adopted["id"]}?run={run}">an adopted one</a>' in page.text
     assert re.search(r"adopted by A\. Nyberg , .* UTC, wall clock: é, “why”", text_of(page))
+    # Lists mark it, and one of adopted results alone has it.
+    for asked in ({}, {"adopted": "true"}):
+        listed = client.get("/batches", params={"run": run} | asked).text
+        assert re.search(r'title="by A\. Nyberg, [^"]* UTC: é, “why”">adopted</span>', listed)
+    assert '<input type="checkbox" name="adopted" value="true" checked>' in listed
     # It stands among the changes of its time, where no one can delete it.
     trends = client.get("/spacecraft/XTE", params={"run": run})
     assert f"What-if of batch {batch['batch']} adopted by A. Nyberg: é, “why”" in text_of(trends)

@@ -24,6 +24,7 @@ class BatchesMethods:
         outcome: Outcome | None = None,
         status: Status | Literal["none"] | None = None,
         batch: str | None = None,
+        adopted: bool = False,
     ) -> Listing[models.Summary]:
         """The current results of recorded batches, newest first by batch time.
 
@@ -34,6 +35,7 @@ class BatchesMethods:
         - `outcome`: Only batches with at least one star of this outcome.
         - `status`: Only batches with a good attitude, with a suspect one, or with none.
         - `batch`: Only the batch with this batch id; needs `spacecraft`.
+        - `adopted`: Only batches whose current result is an adopted what-if.
 
         >>> [found.batch for found in client.batches("XTE")]
         ['1996-010-0110']
@@ -47,6 +49,7 @@ class BatchesMethods:
             "outcome": outcome,
             "status": status,
             "batch": batch,
+            "adopted": adopted,
         }
         return Listing(models.Summary, path, query)
 

@@ -301,7 +301,7 @@ class Summary(Model, frozen=True, kw_only=True):
     reason: str | None
     measures: dict[str, float | None]
     parent: str | None
-    """The result that a what-if started from."""
+    """The result that a what-if started from; a current result with one is adopted."""
     current: bool
     """True if this is the current result of its batch."""
     archived: bool

@@ -47,19 +47,23 @@ def list_batches(
     outcome: OutcomeName | None,
     status: StatusName | None,
     batch: str | None,
+    adopted: bool,
     limit: int,
     cursor: str | None,
 ) -> Page[answers.Summary]:
     """List current results, recorded and archived, newest batch time first.
 
     `outcome` keeps batches with at least one star of it; `status` those whose attitude is good or
-    suspect, or that have none; `batch` the one with this batch id in each selected run.
+    suspect, or that have none; `batch` the one with this batch id in each selected run; `adopted`
+    those whose current result is an adopted what-if.
     """
     chosen = _conditions(selected, batch)
     if outcome is not None:
         chosen.append(results.c[outcome] > 0)
     if status is not None:
         chosen.append(results.c.status == (None if status == "none" else status))
+    if adopted:
+        chosen.append(results.c.parent_id.is_not(None))
     parts = None
     if batch is not None:
         parts = parts_with(connection, selected.spacecraft, selected.run, batch)

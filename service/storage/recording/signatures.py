@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any
 
@@ -41,15 +42,16 @@ def result_in(body: str | None) -> str | None:
     return None if found is None else found[1]
 
 
-def signature_of(connection: Connection, parent: str, id: str) -> Signature | None:
-    """Signature on a recorded what-if of the result `parent`; None if no audit entry names it."""
-    start = json.dumps({"result": id}).removesuffix("}")
-    query = select(audit).where(
-        audit.c.about == f"/api/v1/batches/{parent}/what-if",
-        audit.c.body.startswith(start, autoescape=True),
-    )
-    row = connection.execute(query).mappings().first()
-    if row is None:
-        return None
-    who, reason = signed_in(row["body"])
-    return Signature(who=who or row["who"], at=row["moment"], comment=reason)
+def signatures_of(connection: Connection, parents: Mapping[str, str]) -> dict[str, Signature]:
+    """Signatures on recorded what-ifs by their ids, from the ids of the results they started from.
+
+    A what-if that no audit entry names has none.
+    """
+    abouts = [f"/api/v1/batches/{parent}/what-if" for parent in set(parents.values())]
+    found: dict[str, Signature] = {}
+    for row in connection.execute(select(audit).where(audit.c.about.in_(abouts))).mappings():
+        id = result_in(row["body"])
+        if id is not None and id in parents:
+            who, reason = signed_in(row["body"])
+            found[id] = Signature(who=who or row["who"], at=row["moment"], comment=reason)
+    return found

@@ -148,6 +148,9 @@ class BatchQuery(PeriodPageQuery):
     batch: Annotated[
         Key | None, Field(description="Only the batch with this batch id; needs `spacecraft`.")
     ] = None
+    adopted: Annotated[
+        bool, Field(description="Only batches whose current result is an adopted what-if.")
+    ] = False
 
     @model_validator(mode="after")
     def _batch_of_a_spacecraft(self) -> Self:

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
-from urllib.parse import quote, urlencode
+from urllib.parse import urlencode
 
 from fastapi import Path
 from msgspec import json, structs
@@ -25,7 +25,7 @@ from service.times import Utc, recorded_utc
 from service.trends.quantities import QUANTITIES
 from service.vectors import matrix_from_quaternion, to_ra_dec
 from service.web.console.charts.sky_chart import sky_chart
-from service.web.console.formatting import arcsec, share
+from service.web.console.formatting import arcsec, share, with_day_of_year
 from service.web.console.options import (
     asked_options,
     batch_settings,
@@ -37,7 +37,6 @@ from service.web.console.page import (
     ContextDep,
     FromQuery,
     PageContext,
-    PageQuery,
     PeriodQuery,
     console_page,
     typed_utc,
@@ -172,7 +171,7 @@ def adoption(before: Answer, after: Answer) -> list[str]:
     return [
         *_worse(before, after),
         f"1 batch changes: {', '.join(changes) or 'its counts and its status stay the same'}.",
-        f"Lists, rates and every trend of {after.spacecraft} show the new result at {after.time}.",
+        f"Lists and trends of {after.spacecraft} show it at {with_day_of_year(after.time)} UTC.",
         (
             "The mission's settings stay: other batches do not change. "
             "To undo it, adopt the former result, which stays readable."
@@ -206,14 +205,6 @@ def _putting_back(context: PageContext, record: Result) -> list[str]:
     if record.parent is None or not record.current:
         return []
     return adoption(record.answer, context.app.results.get(record.parent).answer)
-
-
-@console_page("/latest/{name}", "Latest batch", Policy("read", "path"), section="/batches")
-def latest_batch(name: str, query: FromQuery[PageQuery], context: ContextDep) -> Response:
-    """Redirect to the latest batch of a spacecraft in a run, or else to the spacecraft's page."""
-    items = context.app.results.page(spacecraft=name, run=query.run, limit=1).items
-    address = f"/batches/{items[0].id}" if items else f"/spacecraft/{quote(name)}"
-    return RedirectResponse(f"{address}?{urlencode({'run': query.run})}", 303)
 
 
 def _stars(shown: Answer, before: Answer | None, field: StarField) -> list[VoteRow]:
@@ -280,6 +271,7 @@ class BatchesQuery(PeriodQuery):
     spacecraft: Key | Any_ = ""
     outcome: OutcomeName | Any_ = ""
     status: StatusName | Any_ = ""
+    adopted: bool = False
     find: Annotated[str, Field(max_length=200)] = ""
     """Text that the search form sends: the id of a batch or of a result, or a time."""
     cursor: Cursor = None
@@ -313,6 +305,7 @@ def batches_page(query: FromQuery[BatchesQuery], context: ContextDep) -> Respons
             end=query.bounds["end"],
             outcome=query.outcome or None,
             status=query.status or None,
+            adopted=query.adopted,
             limit=ROWS,
             cursor=query.cursor,
         )
@@ -321,6 +314,7 @@ def batches_page(query: FromQuery[BatchesQuery], context: ContextDep) -> Respons
         query.run,
         query=query,
         page=page,
+        signatures=context.app.results.signatures({each.id: each.parent for each in page.items}),
         moment=moment,
         nearest=nearest,
         spacecraft=context.spacecraft,

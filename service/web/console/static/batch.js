@@ -76,10 +76,6 @@ document.addEventListener("click", (event) => {
     form().elements.view.value = view.dataset.view;
     draw(address());
   }
-  if (event.target.closest("[data-reset]")) {
-    event.preventDefault();
-    draw(form().action);
-  }
 });
 document.addEventListener("mouseover", (event) => point(event, true));
 document.addEventListener("mouseout", (event) => point(event, false));
