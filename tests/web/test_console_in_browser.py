@@ -130,8 +130,10 @@ def test_the_first_chart_is_ambiguity_and_few_controls_stand_before_it(browser, 
     assert browser.run("document.querySelector('[data-chart]').dataset.chart") == "stars"
     controls = browser.run(BEFORE_THE_CHART)
     assert len(controls) <= 8, controls
-    # To share a view is one of them.
-    assert "Copy link" in controls
+    # Four of them are above the chart; to share the view stands below it.
+    assert controls[-5:] == ["range", "◀ Earlier", "Later ▶", "Compare with…", "More"]
+    link = "document.querySelector('[data-copy]').getBoundingClientRect().top"
+    assert browser.run(link) < 1000
     assert browser.run("document.querySelector('[data-chart]').getBoundingClientRect().top") < 500
 
 
@@ -240,26 +242,48 @@ def test_a_bad_time_is_told_beside_its_field_and_the_form_is_kept(browser, addre
     assert browser.complaints == []
 
 
+PICK = "document.getElementById('beside-{}')"
+KEYS = "[data-chart=stars] + .chart-keys"
+
+
+def test_the_first_chart_is_saved_as_a_picture_with_its_key(browser, address, full_run):
+    browser.open(f"{address}/spacecraft/XTE?run={full_run}&beside=SOHO")
+    browser.wait(lambda: browser.run(DRAWN))
+    shows(browser, "SOHO: ambiguous stars", KEYS)
+    browser.run(
+        "HTMLAnchorElement.prototype.click = function () {"
+        " window.saved = [this.download, this.href]; };"
+        "const lines = CanvasRenderingContext2D.prototype.fillText; window.written = [];"
+        "CanvasRenderingContext2D.prototype.fillText = function (text, ...place) {"
+        " window.written.push(text); return lines.call(this, text, ...place); };"
+    )
+    browser.run("document.querySelector('[data-picture]').click()")
+    name, file = browser.run("window.saved")
+    assert name == "XTE-stars.png"
+    assert file.startswith("data:image/png;base64,")
+    written = " ".join(browser.run("window.written"))
+    assert "XTE: Ambiguous and unmatched stars, " in written
+    assert "SOHO: ambiguous stars" in written
+    assert browser.complaints == []
+
+
 def test_a_point_of_a_trend_leads_to_its_batches_and_lines_can_be_hidden(
     browser, address, full_run
 ):
     browser.open(f"{address}/spacecraft/XTE?run={full_run}")
     browser.wait(lambda: browser.run(DRAWN))
-    # Further spacecraft are added one by one, and leave by a button.
-    browser.run("document.querySelector('#more').open = true")
-    add = (
-        "(menu => {{ menu.value = '{}';"
-        "menu.dispatchEvent(new Event('change', {{bubbles: true}})); }})"
-        "(document.querySelector('[data-view] [name=beside]:not([type=hidden])'))"
-    )
+    # Further spacecraft are picked from a list, several while it is open.
+    browser.run("document.querySelector('#compare summary').click()")
     for name in ("SWAS", "SOHO"):
-        browser.run(add.format(name))
-        shows(browser, f"Without {name}", "#more")
-    leave = "[...document.querySelectorAll('#more a')].find(e => e.innerText === 'Without SWAS')"
-    browser.run(f"{leave}.click()")
-    browser.wait(lambda: "Without SWAS" not in text(browser, "#more"))
-    assert "Without SOHO" in text(browser, "#more")
-    browser.wait(lambda: "SOHO" in text(browser, "[data-chart=stars] + .chart-keys"))
+        browser.run(f"(box => {{ box.focus(); box.click(); }})({PICK.format(name)})")
+        browser.wait(lambda name=name: f"beside={name}" in browser.run("location.search"))
+    shows(browser, "Compare with… (2)", "#compare")
+    assert browser.run("document.activeElement.id") == "beside-SOHO"
+    shows(browser, "SWAS: ambiguous stars", KEYS)
+    browser.run(f"{PICK.format('SWAS')}.click()")
+    shows(browser, "Compare with… (1)", "#compare")
+    browser.wait(lambda: "SWAS" not in text(browser, KEYS))
+    assert "SOHO: ambiguous stars" in text(browser, KEYS)
     key = "document.querySelector('[data-chart=stars] + .chart-keys button')"
     assert "XTE: " in browser.run(f"{key}.innerText")
     browser.run(f"{key}.click()")

@@ -1,7 +1,9 @@
 """The overview of 40 and of 200 spacecraft in a real browser, six of them in trouble."""
 
 import gzip
+import html
 import json
+import re
 
 import httpx
 import pytest
@@ -194,6 +196,35 @@ def test_a_period_is_entered_by_its_length_or_by_its_ends(browser, filled):
     start_ms, end_ms = browser.run(bounds)
     assert end_ms - start_ms == pytest.approx(12 * 3600 * 1000, abs=1000)
     browser.complaints.clear()
+
+
+def test_spacecraft_to_compare_with_are_picked_from_a_list_narrowed_by_text(browser, filled):
+    size, address = filled
+    browser.open(f"{address}/spacecraft/SAT-000")
+    browser.run("document.querySelector('#compare summary').click()")
+    shown = "[...document.querySelectorAll('.picks li')].filter(e => e.checkVisibility()).length"
+    # Those that never sent anything, too.
+    assert browser.run(shown) == size + 3
+    typed = "document.querySelector('[data-narrow] input')"
+    browser.run(
+        "(box => { box.value = 'sat-01';"
+        f"box.dispatchEvent(new Event('input', {{bubbles: true}})); }})({typed})"
+    )
+    browser.wait(lambda: browser.run(shown) == 10)
+    for number in range(4):
+        browser.run(f"document.getElementById('beside-SAT-01{number}').click()")
+        browser.wait(lambda number=number: f"SAT-01{number}" in browser.run("location.search"))
+    browser.wait(lambda: "(4)" in browser.run("document.querySelector('#compare').innerText"))
+    # The filter stays, and no chart tells more than four others apart.
+    assert browser.run(f"{typed}.value") == "sat-01"
+    browser.wait(lambda: browser.run(shown) == 10)
+    assert browser.run("document.getElementById('beside-SAT-014').disabled")
+    assert not browser.run("document.getElementById('beside-SAT-013').disabled")
+    assert faults(browser) == []
+    page = httpx.get(f"{address}/spacecraft/SAT-000?beside=SAT-001&beside=SAT-002").text
+    assert len(json.loads(html.unescape(re.search(r'data-others="([^"]*)"', page)[1]))) == 2
+    assert page.count(" checked> SAT-00") == 2
+    assert browser.complaints == []
 
 
 def test_what_was_typed_stays_when_something_happens_meanwhile(browser, filled):

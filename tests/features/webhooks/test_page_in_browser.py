@@ -42,7 +42,7 @@ def test_a_webhook_is_made_tried_paused_and_deleted_on_its_page(service, receive
     browser.wait(lambda: browser.run(SHOWN) == ["<b>pager</b> ‖ paused"])
     assert service.read(made)["enabled"] is False
     browser.run("document.querySelector('[data-webhook] summary').click()")
-    browser.run(CLICK.format("delete"))
+    browser.run("document.querySelector('[data-webhook] details button').click()")
     browser.wait(lambda: browser.run(SHOWN) == [])
     assert browser.run(STATUS) == "Deleted: <b>pager</b>."
     assert browser.complaints == []

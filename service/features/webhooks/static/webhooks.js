@@ -1,4 +1,4 @@
-// Registers, tries out, pauses and deletes webhooks.
+// Registers, tries out and pauses webhooks.
 import { attempt, send } from "./actions.js";
 import { refreshSoon } from "./live_updates.js";
 
@@ -25,10 +25,6 @@ const ACTIONS = {
     if (!outcome.delivered) throw new Error(outcome.fault);
     return `The receiver answered ${outcome.status} after ${outcome.duration_ms} ms.`;
   },
-  async retry(address) {
-    const { queued } = await send("POST", `${address}/retry`, "{}");
-    return `Dead letters queued: ${queued}.`;
-  },
   async pause(address) {
     await changed(address, false);
     return "Paused: nothing is sent until it goes on.";
@@ -40,10 +36,6 @@ const ACTIONS = {
   async secret(address) {
     showSecret(await send("POST", `${address}/secret`, "{}"));
     return "New secret. The previous one signs too for 24 hours.";
-  },
-  async delete(address) {
-    const webhook = await send("DELETE", address);
-    return `Deleted: ${webhook.name}.`;
   },
 };
 

@@ -66,7 +66,7 @@ async def _query(request: Request) -> CompareQuery:
         raise BadBatch(options.faults_of_form(error)) from None
 
 
-@console_page("/compare", "Compare", Policy("read", "nothing"), position=40)
+@console_page("/compare", "Compare runs", Policy("read", "nothing"), position=40)
 def compare_page(
     request: Request, query: Annotated[CompareQuery, Depends(_query)], context: ContextDep
 ) -> Response:

@@ -56,11 +56,6 @@ VERTICAL: dict[Vertical, str] = {
     "log": "logarithmic",
 }
 ANNOTATIONS = 100
-FIRST_LOOKED_AT: tuple[RankedName, ...] = (
-    "ambiguous_share",
-    "unmatched_share",
-    "a_priori_angle_deg",
-)
 
 
 class SpacecraftQuery(PageQuery):
@@ -188,9 +183,10 @@ def spacecraft_page(name: str, query: FromQuery[SpacecraftQuery], context: Conte
         why=context.panels("ambiguity", name, query.run, stretch, before) if before else [],
         vertical=VERTICAL,
         others=_others(context, query, stretch),
-        spacecraft=[each for each in context.spacecraft if each not in (name, *query.others)]
-        if len(query.others) < MOST_BESIDE
-        else [],
+        spacecraft=sorted(
+            set(context.spacecraft) - {name}, key=lambda each: (each not in query.others, each)
+        ),
+        most_beside=MOST_BESIDE,
         changes=_changes(context, name, state.history, query, stretch),
         annotations=sorted(notes.items, key=lambda each: recorded_utc(each.start).tai_ns),
         more_annotations=notes.next_cursor is not None,
@@ -246,28 +242,19 @@ def _fitting_range(context: PageContext, name: str, run: str, end: Utc) -> Range
 def _worst(
     context: PageContext, name: str, query: SpacecraftQuery, stretch: ShownPeriod | None
 ) -> Ranking:
-    """Worst batches by a quantity: by default the first one whose worst value is not zero."""
-    asked = (query.by,) if query.by else FIRST_LOOKED_AT
-    if query.tracker and not query.by:
-        asked = tuple(by for by in FIRST_LOOKED_AT if QUANTITIES[by].by_tracker)
+    """Worst batches by the requested quantity, or by ambiguous stars."""
+    by = query.by or "ambiguous_share"
     if stretch is None:
-        return Ranking(by=asked[0], items=[])
-    found = []
-    for by in asked:
-        found.append(
-            context.app.spacecraft.ranking(
-                name,
-                by=by,
-                run=query.run,
-                start=stretch.start,
-                end=stretch.end,
-                limit=WORST,
-                tracker=query.tracker,
-            )
-        )
-        if found[-1].items and found[-1].items[0].value:
-            return found[-1]
-    return found[0]
+        return Ranking(by=by, items=[])
+    return context.app.spacecraft.ranking(
+        name,
+        by=by,
+        run=query.run,
+        start=stretch.start,
+        end=stretch.end,
+        limit=WORST,
+        tracker=query.tracker,
+    )
 
 
 def _others(context: PageContext, query: SpacecraftQuery, stretch: ShownPeriod | None) -> list[str]:

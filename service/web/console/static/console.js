@@ -29,19 +29,25 @@ system.addEventListener("change", () => {
 });
 nameTheme();
 
-const runs = document.querySelector("[data-run-form]");
-// The menu itself is replaced when the list of runs changes.
-runs.addEventListener("change", () => runs.requestSubmit());
-
 // On a narrow screen the content stands before the filter.
 if (matchMedia("(max-width: 720px)").matches) {
   for (const each of document.querySelectorAll(".filter:not([data-open])")) each.open = each.querySelector("[aria-invalid]") !== null;
 }
 
-// The range is chosen by the menu alone; the charts of a spacecraft are drawn without loading the page anew.
+// A form with `data-now` is sent at each choice; a menu then lets go of the focus, so that it is drawn anew.
 document.addEventListener("change", ({ target }) => {
-  const form = target.closest("[data-period]");
-  if (form && target.value && !document.getElementById("charts")) form.requestSubmit();
+  const { form } = target;
+  if (!form?.matches("[data-now]")) return;
+  if (target.matches("select")) target.blur();
+  form.requestSubmit();
+});
+
+// The address of a page has the fields of its form that are filled in.
+document.addEventListener("formdata", ({ target, formData }) => {
+  if (!target.matches('[method="get"]')) return;
+  const filled = [...formData].filter(([, value]) => value !== "");
+  for (const name of [...formData.keys()]) formData.delete(name);
+  for (const each of filled) formData.append(...each);
 });
 
 // The navigation is one stop of the Tab key; arrow keys go from page to page.

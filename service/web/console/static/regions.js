@@ -28,7 +28,7 @@ export async function fetchLatest(address) {
   }
 }
 
-// Lets links with `data-go`, and the browser's history, replace the regions of the page; returns
+// Lets links and forms with `data-go`, and the browser's history, replace the regions of the page; returns
 // what shows an address, which the history gets by its method `how`.
 export function withoutReload(tell) {
   async function go(address, how = "pushState") {
@@ -48,6 +48,12 @@ export function withoutReload(tell) {
     event.preventDefault();
     go(link.href);
   });
+  document.addEventListener("submit", (event) => {
+    const { action, dataset } = event.target;
+    if (dataset.go === undefined) return;
+    event.preventDefault();
+    go(`${action}?${new URLSearchParams(new FormData(event.target))}`, dataset.go || undefined);
+  });
   addEventListener("popstate", () => go(location.href, null));
   return go;
 }
@@ -56,7 +62,7 @@ export function withoutReload(tell) {
 function isBusy(region) {
   const active = document.activeElement;
   const marked = document.getSelection();
-  const typing = region.contains(active) && active.matches("input, textarea, select");
+  const typing = region.contains(active) && active.matches("input:not(.pick), textarea, select");
   return typing || (marked && !marked.isCollapsed && region.contains(marked.anchorNode));
 }
 

@@ -406,9 +406,9 @@ export class Trend {
     keys.className = "chart-keys range";
     const own = this.others.length ? `${this.history.spacecraft}: ` : "";
     const buttons = own || this.known.length > 1 ? this.known.map(({ name, label, dash }) => this.key(name, `${dash ? "╌" : "━"} ${own}${label}`)) : [];
-    const names = this.others.map(({ spacecraft, shift }, k) => {
+    const names = this.others.map(({ spacecraft, shift, unix_s: moments }, k) => {
       const mark = element("span", { className: shift ? "soft" : TONES[k % TONES.length].slice(2), ariaHidden: "true" }, "━ ");
-      return element("span", {}, mark, `${spacecraft}: ${this.known[0].label}${shift ? `, ${shift / DAY_S} d before` : ""}`);
+      return element("span", {}, mark, `${spacecraft}: ${this.known[0].label}${shift ? `, ${shift / DAY_S} d before` : ""}${moments.length ? "" : ", no batches then"}`);
     });
     keys.replaceChildren(...buttons, ...names);
     keys.hidden = !keys.childElementCount;
