@@ -56,6 +56,7 @@ VERTICAL: dict[Vertical, str] = {
     "log": "logarithmic",
 }
 ANNOTATIONS = 100
+FIRST_LOOKED_AT = "ambiguous_share", "unmatched_share"
 
 
 class SpacecraftQuery(PageQuery):
@@ -242,19 +243,21 @@ def _fitting_range(context: PageContext, name: str, run: str, end: Utc) -> Range
 def _worst(
     context: PageContext, name: str, query: SpacecraftQuery, stretch: ShownPeriod | None
 ) -> Ranking:
-    """Worst batches by the requested quantity, or by ambiguous stars."""
-    by = query.by or "ambiguous_share"
-    if stretch is None:
-        return Ranking(by=by, items=[])
-    return context.app.spacecraft.ranking(
-        name,
-        by=by,
-        run=query.run,
-        start=stretch.start,
-        end=stretch.end,
-        limit=WORST,
-        tracker=query.tracker,
-    )
+    """Worst batches by a quantity: by default the first one whose worst value is not zero."""
+    ranking = Ranking(by=query.by or FIRST_LOOKED_AT[0], items=[])
+    for by in (query.by,) if query.by else FIRST_LOOKED_AT:
+        if stretch is None or (ranking.items and ranking.items[0].value):
+            break
+        ranking = context.app.spacecraft.ranking(
+            name,
+            by=by,
+            run=query.run,
+            start=stretch.start,
+            end=stretch.end,
+            limit=WORST,
+            tracker=query.tracker,
+        )
+    return ranking
 
 
 def _others(context: PageContext, query: SpacecraftQuery, stretch: ShownPeriod | None) -> list[str]:
