@@ -43,7 +43,8 @@ from service.storage.archive.folder import (
     manifest_of,
     manifests,
 )
-from service.storage.archive.reading import Archive, PlacedPart, parts_between
+from service.storage.archive.reading import ParquetArchive
+from service.storage.archived import PlacedPart, parts_between
 from service.storage.queries.pages import PLACE, Place, ResultFilter, bounds_of
 from service.storage.recording.identity import look_up
 from service.storage.sql.tables import batches, results, rollups_daily
@@ -178,12 +179,12 @@ class Planner:
     folder: Path
     plan: ReprocessPlan
     catalog_digest: str
-    _archive: Archive = field(init=False)
+    _archive: ParquetArchive = field(init=False)
     _days: dict[str, set[int]] = field(init=False, default_factory=dict)
     """Days on which the run has batches, by spacecraft."""
 
     def __post_init__(self) -> None:
-        self._archive = Archive(self.folder)
+        self._archive = ParquetArchive(self.folder)
 
     def require_same_settings(self) -> None:
         """Raise `BadBatch` where the archive has parts of the run with other settings."""

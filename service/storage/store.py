@@ -7,7 +7,8 @@ from pathlib import Path
 from sqlalchemy import Connection
 
 from service import logs
-from service.storage.archive.reading import Archive
+from service.storage.archive.reading import ParquetArchive
+from service.storage.archived import Archive
 from service.storage.progress import Progress
 from service.storage.readers import Readers
 from service.storage.recording.events import HeardEvents
@@ -49,7 +50,7 @@ class Store(Readers):
         Raises `BadConfiguration` with the remedy.
         """
         self.features_off = features_off
-        self.archive = Archive(archive_folder)
+        self.archive: Archive = ParquetArchive(archive_folder)
         url = engines.database_url(database)
         file = engines.database_file(url)
         if file is not None and not create:

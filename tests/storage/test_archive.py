@@ -17,7 +17,7 @@ from service.errors import BadConfiguration, Busy, Conflict
 from service.ingest import submit
 from service.observations.schema import OptionsIn
 from service.storage.archive import folder, rows
-from service.storage.archive.reading import Archive
+from service.storage.archive.reading import ParquetArchive
 from service.storage.archive.rows import WHOLE, Opened, columns_of
 from service.storage.projections import rollups
 from service.storage.sql.columns import metadata
@@ -436,7 +436,7 @@ def test_a_part_of_an_earlier_version_has_no_values_of_later_quantities(
         of_trackers = connection.execute(select(tracker_values.c.scale_offset_ppm)).scalars()
         assert [*shown, *of_trackers] == [None] * 9
     pq.write_table(partition, place / "earlier.parquet")
-    read = Archive(place).read("earlier.parquet", columns_of(WHOLE), None)
+    read = ParquetArchive(place).read("earlier.parquet", columns_of(WHOLE), None)
     assert read.num_rows == 3
     assert not set(later) & set(read.column_names)
 

@@ -145,7 +145,7 @@ def _folder(path: Path | None, option: str) -> Path:
 
 def _parts(parsed: Namespace) -> dict[str, str]:
     """Hashes of the archive files that the database refers to, by path."""
-    from service.storage.archive.reading import archived_paths
+    from service.storage.archived import archived_paths
     from service.storage.readers import Readers
 
     with (

@@ -14,7 +14,7 @@ from service.features.definitive.day import definitive_day, window_of
 from service.features.definitive.inputs import days_with_batches, inputs_digest, recorded_in
 from service.missions.mission import Mission, mission_named
 from service.observations.schema import LIVE
-from service.storage.archive.reading import holds_any
+from service.storage.archived import holds_any
 from service.storage.queries.pages import ResultFilter
 from service.storage.recording.ids import Ulids
 from service.times import Utc, utc_now

@@ -9,7 +9,7 @@ from sqlalchemy import Select, select
 from service.acquire.result import METHOD
 from service.ephemerides.rows import AttitudeRows
 from service.observations.decode import RECORDED_RATES
-from service.storage.archive.reading import Archive
+from service.storage.archived import Archive
 from service.storage.queries.pages import (
     COVARIANCE,
     PLACE,

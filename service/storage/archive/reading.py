@@ -1,20 +1,18 @@
-"""Reading of archived batches for the service; only this module knows where a batch is stored."""
+"""Reading of archived batches from the Parquet files of an archive."""
 
 import logging
-from collections.abc import Collection, Iterator, Sequence, Set
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sqlalchemy import ColumnElement, Connection, select
+from sqlalchemy import Connection
 
-from service.errors import AcquisitionError, Busy, Fault, NotAvailable
+from service.errors import Busy, Fault, NotAvailable
 from service.extras import require_extra
 from service.sky.cache import LruCache
-from service.storage.recording.identity import stored_answers
-from service.storage.sql import tables
-from service.times import Utc
+from service.storage.archived import Archive, Block, PlacedPart, places
+from service.storage.sql.columns import Row
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -26,31 +24,10 @@ log = logging.getLogger(__name__)
 
 CACHE_BYTES = 64 << 20
 """Size in bytes of the cache of opened row groups."""
+_LOOKED_UP_AT_ONCE = 1_000
 
 
-@dataclass(frozen=True)
-class PlacedPart:
-    """Record of an archive part: file, digest, number of batches, times of the first and last."""
-
-    id: int
-    path: str
-    sha256: str
-    first_ns: int
-    last_ns: int
-    batches: int
-
-
-@dataclass(frozen=True)
-class Block:
-    """Place of one row group, the least that is read of an archive part, with its time span."""
-
-    part: PlacedPart
-    group: int
-    first_ns: int
-    last_ns: int
-
-
-class Archive:
+class ParquetArchive(Archive):
     """Reader of the archive folder of a database; the folder is None if none is configured.
 
     Every method raises `Busy` where a file cannot be read, and `NotAvailable` without the folder,
@@ -61,28 +38,11 @@ class Archive:
         self.folder = folder
         self.cache = LruCache(CACHE_BYTES)
 
-    def stored_answers(self, connection: Connection, ids: Collection[str]) -> dict[str, bytes]:
-        """Answers of recorded or archived results by id, byte for byte; without unknown ids."""
-        found = stored_answers(connection, ids)
-        if len(found) == len(ids):
-            return found
-        for path, wanted in places(connection, set(ids) - found.keys()).items():
-            read = self.read(path, ["id", "answer"], [("id", "in", list(wanted))])
-            rows = zip(read["id"].to_pylist(), read["answer"].to_pylist(), strict=True)
-            found |= {id: answer.encode() for id, answer in rows}
-        return found
-
-    def answers_or_faults(
-        self, connection: Connection, ids: Set[str]
-    ) -> dict[str, bytes | AcquisitionError]:
-        """Answers of recorded or archived results by id, or the error that prevents reading one."""
-        found: dict[str, bytes | AcquisitionError] = {**stored_answers(connection, ids)}
-        if archived := ids - found.keys():
-            try:
-                found |= self.stored_answers(connection, archived)
-            except AcquisitionError as error:
-                found |= dict.fromkeys(archived, error)
-        return found
+    def answers_in(self, path: str, ids: Sequence[str]) -> dict[str, bytes]:
+        """Answers of results in an archive part by id, byte for byte."""
+        read = self.read(path, ["id", "answer"], [("id", "in", list(ids))])
+        rows = zip(read["id"].to_pylist(), read["answer"].to_pylist(), strict=True)
+        return {id: answer.encode() for id, answer in rows}
 
     def read(self, path: str, columns: Sequence[str] | None, filters: Any) -> "pa.Table":
         """Read columns, or all, of the results in an archive part that pass pyarrow's `filters`.
@@ -103,18 +63,8 @@ class Archive:
                 page_checksum_verification=True,
             )
 
-    def batch(self, connection: Connection, id: str) -> "Opened | None":
-        """Open the batch of an archived result with all its results; None if it is not archived."""
-        if (
-            connection.scalar(select(tables.results.c.id).where(tables.results.c.id == id))
-            is not None
-        ):
-            return None
-        found = places(connection, [id])
-        if not found:
-            return None
-        ((path, _),) = found.items()
-        batch_id = batch_of(connection, id)
+    def batch_in(self, path: str, batch_id: str) -> "Opened":
+        """Open a batch in an archive part with all its results and their settings."""
 
         def build() -> "Opened":
             from service.storage.archive.folder import read_settings
@@ -161,14 +111,43 @@ class Archive:
         key = (block.part.path, block.part.sha256, block.group, *sorted(needs))
         return self.cache.get(key, build)[0]
 
-    def current_ids(
-        self, part: PlacedPart, start_ns: int | None, end_ns: int | None
-    ) -> "pa.ChunkedArray":
+    def current_ids(self, part: PlacedPart, start_ns: int | None, end_ns: int | None) -> list[str]:
         """Ids of an archive part's current results from a time to before another, in order."""
         filters: list[tuple[str, str, object]] = [("current", "=", True)]
         filters += [("time_ns", ">=", start_ns)] if start_ns is not None else []
         filters += [("time_ns", "<", end_ns)] if end_ns is not None else []
-        return self.read(part.path, ["id"], filters)["id"]
+        found: list[str] = self.read(part.path, ["id"], filters)["id"].to_pylist()
+        return found
+
+    def rows(self, part: PlacedPart, ids: Sequence[str], columns: Sequence[str]) -> list[Row]:
+        """Columns of results and their batches in an archive part, in order of time."""
+        found: list[Row] = self.read(part.path, columns, [("id", "in", list(ids))]).to_pylist()
+        return found
+
+    def together(
+        self,
+        connection: Connection,
+        recorded: Sequence[str],
+        archived: Sequence[str],
+        needs: Collection[str],
+    ) -> "Opened":
+        """Open recorded and archived batches in one database, by ids; `needs` as for `open`."""
+        require_extra("tables", "pyarrow", "archive", str(self.folder))
+        from service.storage.archive.rows import Opened, columns_of, read_rows
+
+        opened = Opened()
+        if recorded:
+            opened.add_rows(read_rows(connection, recorded))
+        of_file: dict[str, list[str]] = {}
+        for first in range(0, len(archived), _LOOKED_UP_AT_ONCE):
+            some_ids = archived[first : first + _LOOKED_UP_AT_ONCE]
+            for path, ids in places(connection, some_ids).items():
+                of_file.setdefault(path, []).extend(ids)
+        for path, ids in of_file.items():
+            own: Any = [[("id", "in", ids)], [("batch_id", "in", ids)]]
+            opened.add_partition(self.read(path, columns_of(needs), own))
+        opened.add_indexes()
+        return opened
 
     @contextmanager
     def _readable(self, path: str) -> Iterator[Path]:
@@ -192,68 +171,3 @@ class Archive:
                 "the batches are archived, and the archive cannot be read now: have the folder "
                 "of ACQUIRE_ARCHIVE_FOLDER mounted, or restored from its backup"
             ) from error
-
-
-def parts_between(
-    connection: Connection,
-    spacecraft: str | None,
-    run: str | None,
-    first_ns: int | None,
-    end_ns: int | None,
-) -> list[PlacedPart]:
-    """Archive parts that overlap a period; for None, those of every spacecraft or run."""
-    c = tables.archived_parts.c
-    chosen: list[ColumnElement[bool]] = []
-    if spacecraft is not None:
-        chosen.append(c.spacecraft == spacecraft)
-    if run is not None:
-        chosen.append(c.run == run)
-    if first_ns is not None:
-        chosen.append(c.last_ns >= first_ns)
-    if end_ns is not None:
-        chosen.append(c.first_ns < end_ns)
-    columns = (c.id, c.path, c.sha256, c.first_ns, c.last_ns, c.batches)
-    return [PlacedPart(*row) for row in connection.execute(select(*columns).where(*chosen))]
-
-
-def parts_with(
-    connection: Connection, spacecraft: str | None, run: str | None, batch: str
-) -> set[int]:
-    """Ids of the archive parts that have a batch with this name."""
-    c = tables.archived_batches.c
-    # The unique index begins with spacecraft and run: give both.
-    in_runs = select(tables.runs.c.name) if run is None else [run]
-    query = select(c.part_id).where(
-        c.spacecraft == spacecraft, c.run.in_(in_runs), c.batch == batch
-    )
-    return set(connection.scalars(query))
-
-
-def batch_of(connection: Connection, id: str) -> str:
-    """Id of the batch that an archived result belongs to."""
-    what_ifs = tables.archived_what_ifs.c
-    return connection.scalar(select(what_ifs.batch_id).where(what_ifs.id == id)) or id
-
-
-def places(connection: Connection, ids: Collection[str]) -> dict[str, list[str]]:
-    """Group ids of archived results by the path of their archive part."""
-    batches, what_ifs = tables.archived_batches.c, tables.archived_what_ifs.c
-    path, has_part = tables.archived_parts.c.path, tables.archived_parts.c.id == batches.part_id
-    first = select(batches.id, path).where(has_part, batches.id.in_(ids))
-    further = select(what_ifs.id, path).where(has_part, what_ifs.batch_id == batches.id)
-    found: dict[str, list[str]] = {}
-    for query in (first, further.where(what_ifs.id.in_(ids))):
-        for id, file in connection.execute(query):
-            found.setdefault(file, []).append(id)
-    return found
-
-
-def holds_any(connection: Connection, spacecraft: str, run: str, start: Utc, end: Utc) -> bool:
-    """True if an archive part overlaps a period, so that some of its batches may be archived."""
-    return bool(parts_between(connection, spacecraft, run, start.tai_ns, end.tai_ns))
-
-
-def archived_paths(connection: Connection) -> dict[str, str]:
-    """SHA-256 of all archive parts with batches of a database, by path."""
-    query = select(tables.archived_parts.c.path, tables.archived_parts.c.sha256)
-    return dict(map(tuple, connection.execute(query)))

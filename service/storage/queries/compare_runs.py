@@ -4,22 +4,19 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from sqlalchemy import Connection, Subquery, Table, and_, case, func, or_, select, tuple_
 
 from service.contract import runs as models
-from service.storage.archive.reading import Archive, parts_between, places
+from service.storage.archived import Archive, OpenedBatches, parts_between
 from service.storage.queries import pages
 from service.storage.queries.time_buckets import Bucket, BucketFilter, Columns, read_buckets
 from service.storage.sql import tables
 from service.storage.sql.tables import batches, results
 from service.times import DAY_S, HOUR_S, Utc, bucket_start, unix_seconds
 from service.vectors import ARCSEC_PER_RADIAN, Vector
-
-if TYPE_CHECKING:
-    from service.storage.archive.rows import Opened
 
 _READ_AT_ONCE = 10_000
 
@@ -256,7 +253,7 @@ def both_runs(
     selected: pages.ResultFilter,
     other: str,
     latest: int | None,
-) -> Iterator["Opened"]:
+) -> Iterator[OpenedBatches]:
     """Open the selected batches together with those of the same names in another run, latest first.
 
     At most the `latest` of those selected.  Recorded and archived ones are copied into one
@@ -280,7 +277,7 @@ def both_runs(
             own[each.archived].append(each.row.batch_id)
         recorded = [*own[False], *_named(connection, batches, other, names)]
         archived = [*own[True], *_named(connection, tables.archived_batches, other, names)]
-        yield _opened(connection, archive, recorded, archived)
+        yield archive.together(connection, recorded, archived, _COMPARED)
         beyond = found[-1].place
         left = None if left is None else left - len(found)
         if len(found) < limit:
@@ -298,26 +295,6 @@ def _named(
         query = select(c.id).where(c.run == run, tuple_(c.spacecraft, c.batch).in_(chunk))
         found += connection.scalars(query)
     return found
-
-
-def _opened(
-    connection: Connection, archive: Archive, recorded: Sequence[str], archived: Sequence[str]
-) -> "Opened":
-    """Open recorded and archived batches together in one database in memory."""
-    from service.storage.archive.rows import Opened, columns_of, read_rows
-
-    opened = Opened()
-    if recorded:
-        opened.add_rows(read_rows(connection, recorded))
-    of_file: dict[str, list[str]] = {}
-    for first in range(0, len(archived), _AT_ONCE):
-        for path, ids in places(connection, archived[first : first + _AT_ONCE]).items():
-            of_file.setdefault(path, []).extend(ids)
-    for path, ids in of_file.items():
-        own: Any = [[("id", "in", ids)], [("batch_id", "in", ids)]]
-        opened.add_partition(archive.read(path, columns_of(_COMPARED), own))
-    opened.add_indexes()
-    return opened
 
 
 _SHOWN_BY_HOUR_S = 30 * DAY_S

@@ -16,6 +16,7 @@ from service.contract.spacecraft import Overview, OverviewRow, Sparkline, Window
 from service.intervals import share_of_sums
 from service.missions.mission import Mission
 from service.observations.schema import LIVE
+from service.storage.archived import holds_any
 from service.storage.queries import time_buckets
 from service.storage.queries.fleet_rows import DayCounts, FleetRow, KnownAttitude, TrackerCounts
 from service.storage.queries.histories import live_state
@@ -487,7 +488,7 @@ def _read(
 ) -> tuple[int, time_buckets.Columns]:
     are_many = width_s > HOUR_S and (
         time_buckets.batches_about(connection, span) > time_buckets.MAX_BATCHES_SUMMED
-        or time_buckets.has_archived(connection, span)
+        or holds_any(connection, span.spacecraft, span.run, span.start, span.end)
     )
     if are_many:
         return HOUR_S, time_buckets.read_buckets(connection, span, "hour", COUNTS)

@@ -16,7 +16,7 @@ from service.contract.runs import Run
 from service.contract.spacecraft import AttitudeRow, MissionThen, SpacecraftRow, StateFault
 from service.missions.mission import Mission
 from service.observations.schema import LIVE
-from service.storage.archive.reading import Archive
+from service.storage.archived import Archive
 from service.storage.queries import pages
 from service.storage.queries.pages import MOST_OPENED, Listing
 from service.storage.queries.results import summary_of, summary_query

@@ -17,7 +17,7 @@ from sqlalchemy import ColumnElement, Connection, RowMapping, Select, func, sele
 from service.contract.base import Page
 from service.errors import BadBatch, Fault, shown_value
 from service.observations.schema import LIVE
-from service.storage.archive.reading import Archive, Block, PlacedPart, parts_between
+from service.storage.archived import Archive, Block, PlacedPart, parts_between
 from service.storage.recording.ids import is_ulid
 from service.storage.recording.unsaved_result import AHEAD_NS
 from service.storage.sql.tables import batches, results
@@ -163,7 +163,7 @@ class Listing:
     selected: ResultFilter
     newest_first: bool = False
     needs: Collection[str] = ()
-    """Further archive columns to read, beyond those of results and batches; see `rows.WHOLE`."""
+    """Further archive columns to read, beyond those of results and batches; see `Archive.open`."""
     most_opened: int | None = None
     parts: Collection[int] | None = None
     """Ids of the only archive parts to search; None for all."""

@@ -13,11 +13,11 @@ from sqlalchemy import ColumnElement, Connection, Select, bindparam, func, or_, 
 from service.contract import answers
 from service.contract.answers import Answer
 from service.contract.base import Page
-from service.errors import BadBatch, Busy, Fault, NotFound, WrongState, shown_value
+from service.errors import BadBatch, Busy, Fault, NotAvailable, NotFound, WrongState, shown_value
 from service.missions.mission import Mission
 from service.observations.batch import ObservationBatch
 from service.observations.schema import OptionsIn, submission_from_json
-from service.storage.archive.reading import Archive, PlacedPart, parts_with
+from service.storage.archived import Archive, PlacedPart, parts_with
 from service.storage.queries import pages
 from service.storage.queries.pages import (
     PLACE,
@@ -272,7 +272,7 @@ def _next(
     listing = pages.Listing(archive, query, selected, newest_first)
     try:
         found = listing.first_rows(connection, 1, beyond)
-    except Busy:
+    except (Busy, NotAvailable):
         # Without the archive the page of a recorded batch is still shown.
         return None
     return next((summary_of(each.shown) for each in found.rows), None)
@@ -393,9 +393,8 @@ def _of_part(
     archive: Archive, part: PlacedPart, selected: ResultFilter, at: list[int]
 ) -> list[Row]:
     """Selected batches of an archive part at given positions, counted from 0."""
-    ids = archive.current_ids(part, *bounds_of(selected)).take(at).to_pylist()
-    read = archive.read(part.path, ["id", "options", *_SENT], [("id", "in", ids)])
-    return [dict(row) for row in read.to_pylist()]
+    ids = archive.current_ids(part, *bounds_of(selected))
+    return archive.rows(part, [ids[k] for k in at], ["id", "options", *_SENT])
 
 
 def _at_ranks(connection: Connection, selected: ResultFilter, ranks: list[int]) -> list[Row]:

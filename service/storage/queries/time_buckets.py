@@ -86,18 +86,6 @@ def batches_about(connection: Connection, span: BucketFilter) -> int:
     return int(connection.execute(query).scalar() or 0)
 
 
-def has_archived(connection: Connection, span: BucketFilter) -> bool:
-    """True if an archive part overlaps a span, whose batches only the rollups count."""
-    c = tables.archived_parts.c
-    query = select(c.id).where(
-        c.spacecraft == span.spacecraft,
-        c.run == span.run,
-        c.last_ns >= span.start.tai_ns,
-        c.first_ns < span.end.tai_ns,
-    )
-    return connection.execute(query.limit(1)).first() is not None
-
-
 def read_buckets(
     connection: Connection, span: BucketFilter, level: Bucket, names: Names = tables.ROLLED_UP
 ) -> Columns:

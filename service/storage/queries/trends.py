@@ -10,6 +10,7 @@ import numpy.typing as npt
 from sqlalchemy import Case, ColumnElement, Connection, Select, Table, case, func, select, tuple_
 
 from service.contract.spacecraft import History, Numbers, RankedBatch, Series
+from service.storage.archived import holds_any
 from service.storage.queries import time_buckets
 from service.storage.queries.pages import PLACE, ResultFilter, latest_time, newest_first
 from service.storage.queries.results import summary_fields, summary_query
@@ -119,7 +120,8 @@ def _resolution(connection: Connection, span: BucketFilter, size: int) -> tuple[
             end_s - first_s <= HOUR_S
             or time_buckets.batches_about(connection, span) <= time_buckets.MAX_BATCHES_SUMMED
         )
-        if are_few and not time_buckets.has_archived(connection, span):
+        archived = holds_any(connection, span.spacecraft, span.run, span.start, span.end)
+        if are_few and not archived:
             return width_s, "batch"
         width_s = HOUR_S
     if width_s < DAY_S and end_s - first_s > MAX_HOURS_READ * HOUR_S:

@@ -15,7 +15,7 @@ from service.features.advice.statements import zone_statements
 from service.observations.schema import OptionsIn, submission_from_json, tolerances_from_text
 from service.simulate.stretches import Pass
 from service.simulate.telemetry import draw_pass
-from service.storage.archive.reading import Archive
+from service.storage.archived import Archive
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.results import sample_batches
 from service.storage.sql.tables import results, star_results
@@ -38,7 +38,7 @@ def recorded(app, missions, sky, seed):
 def drawn_from(app, size, seed=0, **stretch):
     with app.store.reading() as connection:
         return sample_batches(
-            connection, Archive(None), ResultFilter("night", "XTE", **stretch), size, seed
+            connection, Archive(), ResultFilter("night", "XTE", **stretch), size, seed
         )
 
 
@@ -113,7 +113,7 @@ def test_the_advice_is_that_of_the_batches_themselves_and_changes_nothing(
     batches = [submission_from_json(json.dumps(body)).batch for body in recorded]
     mission = missions["XTE"]
     with app.store.reading() as connection:
-        sample = sample_batches(connection, Archive(None), ResultFilter("night", "XTE"), 1000)
+        sample = sample_batches(connection, Archive(), ResultFilter("night", "XTE"), 1000)
     plain = advise(
         mission,
         batches,
