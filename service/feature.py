@@ -7,6 +7,8 @@ Nothing outside the folder of a feature imports it.  Its package holds a `Featur
   A table whose rows the record's chain binds says so in its `info` (`storage.sql.columns.BOUND`).
   Another package also lists its tables as `TABLES`: they are made where the database lacks them,
   while those of the service are made by its migrations.
+- `archive`: `open_archive(folder)` reads batches that left the database
+  (`storage.archived.Archive`), and `forget_archived` removes some (`storage.upkeep.forget`).
 - `kernels`: `compile_kernels()` compiles the feature's own; a module or a package, which holds all
   its compiled code and all of the feature that this imports (`compiled.cache.SOURCES`).
 - `projection`: `apply(connection, results)` is called with results in the order of the record,
@@ -59,6 +61,7 @@ SHIPPED = tuple(sorted(each.name for each in iter_modules([_FOLDER])))
 
 KINDS = (
     "tables",
+    "archive",
     "kernels",
     "projection",
     "state",

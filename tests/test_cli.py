@@ -211,7 +211,7 @@ def test_a_service_is_ready_without_what_is_used_later(tmp_path):
         *("service.features.pictures.blind", "service.features.pictures.detection"),
         *("service.features.pictures.frames.fits", "service.features.pictures.overlay"),
         *("service.features.products.ck", "service.features.products.scoring"),
-        *("service.identify.triangles", "service.storage.upkeep.archiving", "acquire_client"),
+        *("service.identify.triangles", "service.features.archive.archiving", "acquire_client"),
     ):
         assert late not in loaded
 

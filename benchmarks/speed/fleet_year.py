@@ -20,9 +20,9 @@ from benchmarks.record import SERVICE, record_of
 from benchmarks.sections import table
 from benchmarks.speed.performance import RESULTS
 from benchmarks.speed.scale import DATABASES, TARGET, bytes_in, emptied, filled, size_text, time_at
+from service.features.archive.archiving import archive
 from service.storage.sql.migrations import upgrade
 from service.storage.store import Store
-from service.storage.upkeep.archiving import archive
 
 BATCHES, EVERY_S = 10_000, 60.0
 FLEETS = (1, 100, 1_000, 10_000)

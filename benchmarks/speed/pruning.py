@@ -24,10 +24,10 @@ from benchmarks.report import Report
 from benchmarks.speed.scale import SPACECRAFT, emptied, filled, time_at
 from benchmarks.speed.stored import milliseconds
 from service.app.factory import open_app
+from service.features.archive.archiving import archive
 from service.settings import Settings
 from service.storage.sql.migrations import upgrade
 from service.storage.store import Store
-from service.storage.upkeep.archiving import archive
 from service.storage.upkeep.prune import prune
 from service.times import Utc
 

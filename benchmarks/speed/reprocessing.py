@@ -32,6 +32,8 @@ from benchmarks.speed.posts import (
 from benchmarks.speed.scale import emptied
 from benchmarks.speed.serving import service
 from service.app.factory import App, open_app
+from service.features.archive import archiving
+from service.features.archive.part import Reprocessings
 from service.ingest.reprocess import ReprocessProgress
 from service.missions.mission import load_missions
 from service.settings import Settings
@@ -41,7 +43,6 @@ from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
 from service.storage.sql.migrations import upgrade
-from service.storage.upkeep import archiving
 from service.times import parse_utc, shifted
 
 BATCHES, QUICK_BATCHES = 40_000, 4_000
@@ -94,7 +95,7 @@ def _again(app: App, folder: Path, processes: int) -> tuple[float, ReprocessProg
     def step(now: ReprocessProgress) -> None:
         pace.note(now.recorded)
 
-    progress = app.runs.reprocess_into_archive(
+    progress = app.part(Reprocessings).reprocess(
         f"by-{processes}", folder, source="source", processes=processes, step=step
     )
     return pace.rate, progress

@@ -34,6 +34,7 @@ from benchmarks.report import Report
 from benchmarks.speed.posts import FIRST
 from benchmarks.speed.stored import milliseconds
 from service.app.factory import App, open_app
+from service.features.archive.archiving import PartFilter, archive, restore, verify_archive
 from service.missions.mission import load_missions
 from service.observations.schema import submission_from_json
 from service.settings import Settings
@@ -45,7 +46,6 @@ from service.sky.model import SkyModel
 from service.storage.sql.migrations import upgrade
 from service.storage.sql.tables import batches, results
 from service.storage.store import Store
-from service.storage.upkeep.archiving import PartFilter, archive, restore, verify_archive
 from service.times import Utc, parse_utc
 
 BATCHES, QUICK_BATCHES = 1_000_000, 20_000

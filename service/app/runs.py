@@ -1,9 +1,7 @@
 """Named runs: lists, evaluation of limits, comparisons, removal, and reprocessing."""
 
 import hashlib
-import os
 from collections.abc import Callable, Collection, Mapping
-from pathlib import Path
 
 from sqlalchemy import Connection
 
@@ -13,7 +11,6 @@ from service.contract import runs
 from service.errors import BadBatch, Fault
 from service.ingest.reprocess import ReprocessPlan, ReprocessProgress, reprocess
 from service.ingest.solver_pool import Solver
-from service.ingest.worker_process import WorkerConfig
 from service.missions.mission import Mission, mission_named
 from service.observations.schema import LIVE
 from service.storage.queries import fleet, histories
@@ -21,7 +18,6 @@ from service.storage.queries.compare_runs import changed_batches, compare_runs, 
 from service.storage.queries.pages import ResultFilter
 from service.storage.recording.results import set_run_alarms
 from service.storage.upkeep.forget import ForgetFilter, forget, found
-from service.storage.upkeep.reprocessing import Reprocessing, reprocessings
 from service.times import Utc, utc_now
 
 MOST_COMPARED = 2_000
@@ -136,55 +132,12 @@ class Runs:
         skipped.  With `track` stars are searched about the last attitude of the run, batch after
         batch.  Raises `BadBatch` if the run has results of other settings.
         """
-        plan = self._plan(run, source, spacecraft, start, end, processes, track)
+        plan = self.plan(run, source, spacecraft, start, end, processes, track)
         sky = self._context.sky
         own = Solver(plan.missions, sky)
         return reprocess(self._context.store, plan, sky.catalog.digest, own, step)
 
-    def reprocess_into_archive(
-        self,
-        run: str | None,
-        folder: Path,
-        *,
-        source: str = LIVE,
-        spacecraft: str | None = None,
-        start: Utc | None = None,
-        end: Utc | None = None,
-        processes: int = 0,
-        scheduler: str | None = None,
-        step: Callable[[ReprocessProgress], object] = lambda progress: None,
-    ) -> ReprocessProgress:
-        """Process the batches of a run again into parts of an archive, archived ones included.
-
-        Local processes compute, or the workers of a Dask scheduler.  See `reprocess`.
-        """
-        from service.ingest.partition_coordinator import reprocess_partitions
-        from service.ingest.partition_tasks import LocalProcesses, OwnProcess, Workers
-
-        plan = self._plan(run, source, spacecraft, start, end, processes)
-        if plan.run == LIVE:
-            raise BadBatch(Fault("run", "must be another run than the live one", LIVE))
-        digest = self._context.sky.catalog.digest
-        config = WorkerConfig(plan.missions, plan.catalog, digest, plan.cache_bytes)
-
-        def workers() -> Workers:
-            if scheduler is not None:
-                from service.ingest.dask_workers import DaskWorkers
-
-                return DaskWorkers(scheduler, config, folder)
-            count = processes or os.cpu_count() or 1
-            if count == 1:
-                return OwnProcess(Solver(plan.missions, self._context.sky))
-            return LocalProcesses(config, count)
-
-        return reprocess_partitions(self._context.store, folder, plan, digest, workers, step)
-
-    def reprocessings(self) -> list[Reprocessing]:
-        """Reprocessings into the service's archive, the latest first; empty without an archive."""
-        folder = self._context.settings.archive_folder
-        return [] if folder is None else reprocessings(folder)
-
-    def _plan(
+    def plan(
         self,
         run: str | None,
         source: str,
@@ -194,6 +147,7 @@ class Runs:
         processes: int,
         track: bool = False,
     ) -> ReprocessPlan:
+        """Plan a reprocessing with the settings of this app; see `reprocess`."""
         if spacecraft is not None:
             mission_named(self._context.missions, spacecraft)
         chosen = {

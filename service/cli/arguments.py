@@ -199,19 +199,29 @@ def add_command(
         brief = f"{summary.partition('. ')[0].rstrip('.')}."
         made = parent.add_parser(name, help=brief, **options)
         made.set_defaults(function=function)
-    lines = [line.strip() for line in examples.strip().splitlines()]
-    epilog = "examples:\n" + "\n".join(f"  {line}" for line in lines)
-    made.description = textwrap.fill(summary, 79)
-    made.epilog = f"{epilog}\n\n{notes}" if notes else epilog
+    _set_texts(made, summary, examples, notes)
     if isinstance(made, Parser):
         made.first = first.split()
     return made
+
+
+def describe(parser: argparse.ArgumentParser, function: Function, notes: str = "") -> None:
+    """Let a command that was added before run another function, whose docstring is the help."""
+    _set_texts(parser, *_help_of(function), notes)
+    parser.set_defaults(function=function)
 
 
 def _help_of(function: Function | None) -> tuple[str, str]:
     """The summary and the examples in the docstring of a command's function."""
     summary, _, examples = (inspect.getdoc(function) or "").partition("\n\n")
     return " ".join(summary.splitlines()), examples
+
+
+def _set_texts(parser: argparse.ArgumentParser, summary: str, examples: str, notes: str) -> None:
+    lines = [line.strip() for line in examples.strip().splitlines()]
+    epilog = "examples:\n" + "\n".join(f"  {line}" for line in lines)
+    parser.description = textwrap.fill(summary, 79)
+    parser.epilog = f"{epilog}\n\n{notes}" if notes else epilog
 
 
 def add_group(parent: Any, name: str, summary: str, examples: str) -> Any:

@@ -6,12 +6,13 @@ An archived batch keeps its identity, and its share in the trends, in the databa
 from collections.abc import Collection, Sequence, Set
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NoReturn, Protocol
 
 from sqlalchemy import ColumnElement, Connection, select
 
 from service.errors import AcquisitionError, Fault, NotAvailable
-from service.feature import SETTING
+from service.feature import SETTING, feature_modules
 from service.storage.recording.identity import stored_answers
 from service.storage.sql import tables
 from service.storage.sql.columns import Row
@@ -48,10 +49,10 @@ class OpenedBatches(Protocol):
 
 
 class Archive:
-    """Archived batches of a database, of which this class reads no file.
+    """Interface to the archived batches of a database; reads no file, for the feature is off.
 
-    The archive feature has the class that does, and there every method that reads a file raises
-    `Busy` where it cannot be read.  Here these methods raise `NotAvailable`.
+    Methods that need a file raise `NotAvailable` here.  The archive feature overrides them with
+    ones that read it.
     """
 
     def stored_answers(self, connection: Connection, ids: Collection[str]) -> dict[str, bytes]:
@@ -128,6 +129,14 @@ class Archive:
 def _refuse() -> NoReturn:
     message = f"is archived, and {SETTING} leaves the feature `archive` out, which reads it"
     raise NotAvailable(Fault("batch", message))
+
+
+def open_archive(folder: Path | None, features_off: str) -> Archive:
+    """Open the archive in a folder, with the feature that reads it; see `service.feature`."""
+    opened: list[Archive] = [
+        module.open_archive(folder) for module in feature_modules("archive", features_off)
+    ]
+    return opened[0] if opened else Archive()
 
 
 def parts_between(

@@ -7,8 +7,7 @@ from pathlib import Path
 from sqlalchemy import Connection
 
 from service import logs
-from service.storage.archive.reading import ParquetArchive
-from service.storage.archived import Archive
+from service.storage.archived import open_archive
 from service.storage.progress import Progress
 from service.storage.readers import Readers
 from service.storage.recording.events import HeardEvents
@@ -45,12 +44,12 @@ class Store(Readers):
         the start.  `serving` bounds the waiting times, too, see `Readers`, and on PostgreSQL lets
         one service alone project.
 
-        Features listed in `features_off` project nothing.
+        Features listed in `features_off` project nothing, and read no archive.
 
         Raises `BadConfiguration` with the remedy.
         """
         self.features_off = features_off
-        self.archive: Archive = ParquetArchive(archive_folder)
+        self.archive = open_archive(archive_folder, features_off)
         url = engines.database_url(database)
         file = engines.database_file(url)
         if file is not None and not create:

@@ -102,7 +102,7 @@ def test_a_name_of_no_feature_is_refused_with_the_names_of_all(acquire, monkeypa
     code, _, complaint = acquire("version")
     assert code == 2
     assert (
-        "ACQUIRE_FEATURES_OFF: must be features of advice, alarms, calibration, definitive"
+        "ACQUIRE_FEATURES_OFF: must be features of advice, alarms, archive, calibration"
         in complaint
     )
     assert "(got 'folow')" in complaint
@@ -176,7 +176,7 @@ def served(folder, off, *addresses, path=(), sent=""):
 
 
 def test_with_every_feature_off_the_pages_are_there_and_nothing_of_a_feature_is(tmp_path):
-    pages = ("/", "/about", "/missions", "/batches", "/annotations", "/spacecraft/XTE")
+    pages = ("/", "/about", "/missions", "/batches", "/runs", "/annotations", "/spacecraft/XTE")
     pages += ("/spacecraft/XTE/period",)
     history = "/api/v1/spacecraft/XTE/history?format=csv"
     gone = ("/webhooks", "/alarms", "/api/v1/alarms", "/api/v1/spacecraft/XTE/tracks")
@@ -188,7 +188,8 @@ def test_with_every_feature_off_the_pages_are_there_and_nothing_of_a_feature_is(
         tmp_path, off, *pages, *gone, history, "/metrics", sent="docs/example-batch.json"
     )
     assert not commands & {*SHIPPED, "export", "score", "calibrate", "camera", "frame", "smooth"}
-    assert {"serve", "replay", "history"} <= commands
+    assert {"serve", "replay", "reprocess", "history"} <= commands
+    assert "pyarrow" not in modules
     assert [found[each][0] for each in pages] == [200] * len(pages)
     assert found[history][0] == 200
     assert "1996-010-0110" in found[history][1]

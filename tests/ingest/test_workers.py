@@ -34,8 +34,8 @@ from service.observations.schema import submission_from_json
 from service.settings import Settings
 from service.storage.sql.tables import batches
 from tests import waiting
+from tests.features.archive.partitions.processes import children_of
 from tests.fresh_databases import sqlite_at
-from tests.ingest.partitions.processes import children_of
 from tests.ingest.test_replays import finished
 from tests.ingest.worker_tasks import double, half_sent, settings_once_there, unreadable
 from tests.scale import draws

@@ -11,6 +11,7 @@ from sqlalchemy import select, text, update
 
 from service.cli import main
 from service.errors import BadConfiguration
+from service.features.archive import archiving
 from service.features.products.attitude_formats import write_attitudes
 from service.features.products.part import Products
 from service.storage.projections import heads
@@ -20,7 +21,7 @@ from service.storage.sql.chain_tables import record_facts, record_heads, record_
 from service.storage.sql.columns import BOUND, metadata
 from service.storage.sql.migrations import all_tables
 from service.storage.sql.tables import results
-from service.storage.upkeep import archiving, proofs, verify_chain
+from service.storage.upkeep import proofs, verify_chain
 from service.storage.upkeep.prune import prune
 from service.storage.upkeep.verify import verify
 from service.times import shifted
@@ -320,7 +321,7 @@ def test_an_archive_keeps_the_chain_and_brings_its_results_back(signed, opened, 
 
 
 def test_an_archive_in_another_database_gets_leaves_of_its_own(signed, opened, tmp_path, key):
-    from service.storage.upkeep import archiving
+    from service.features.archive import archiving
     from tests.fresh_databases import sqlite_at
 
     place = tmp_path / "archive"

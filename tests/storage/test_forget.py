@@ -4,6 +4,8 @@ import pytest
 from sqlalchemy import func, select
 
 from service.errors import BadConfiguration, NotFound
+from service.features.archive import archiving
+from service.features.archive.archiving import verify_archive
 from service.storage.sql.columns import metadata
 from service.storage.sql.definitive_tables import graded_days
 from service.storage.sql.tables import (
@@ -15,8 +17,6 @@ from service.storage.sql.tables import (
     rollups_hourly,
     runs,
 )
-from service.storage.upkeep import archiving
-from service.storage.upkeep.archiving import verify_archive
 from service.storage.upkeep.forget import ForgetFilter, forget, found
 from service.storage.upkeep.verify import verify
 from service.times import shifted

@@ -13,6 +13,7 @@ from service.app.factory import open_app
 from service.errors import Busy
 from service.features.alarms.part import Alarms
 from service.features.alarms.tables import alarm_actions, alarms, limits, watches
+from service.features.archive.archiving import PartFilter, archive, restore
 from service.observations.schema import OptionsIn
 from service.settings import Settings
 from service.storage import progress
@@ -32,7 +33,6 @@ from service.storage.sql.tables import (
     tracker_values,
 )
 from service.storage.store import Store
-from service.storage.upkeep.archiving import PartFilter, archive, restore
 from service.storage.upkeep.forget import ForgetFilter, forget
 from service.storage.upkeep.prune import prune
 from service.storage.upkeep.verify import verify

@@ -6,6 +6,7 @@ import pytest
 
 from service.app.factory import open_app
 from service.errors import BadBatch
+from service.features.archive.part import Reprocessings
 from service.gyro.blocks import block_from_json
 from service.ingest.reprocess import ReprocessProgress
 from service.missions.mission import load_missions
@@ -84,7 +85,7 @@ def test_a_run_without_tracking_does_not_continue_with_it(app, flown, tmp_path):
         app.runs.reprocess("again", track=True)
     app.runs.reprocess("tracked", track=True)
     with pytest.raises(BadBatch, match="was begun with --track"):
-        app.runs.reprocess_into_archive("tracked", tmp_path, processes=1)
+        app.part(Reprocessings).reprocess("tracked", tmp_path, processes=1)
     # Without a name the two are two runs.
     assert (
         len({app.runs.reprocess(None, track=track, processes=1).run for track in (False, True)})

@@ -5,12 +5,10 @@ import re
 import httpx
 import numpy as np
 import pytest
-from msgspec import structs
 
 from service.app.factory import open_app
 from service.missions.mission import Mission
-from service.storage.upkeep.reprocessing import Reprocessing, write_reprocessing
-from service.times import parse_utc, shifted, utc_now
+from service.times import parse_utc, shifted
 from service.web.app import create_app
 from tests.web.markup import Markup
 from tests.web.serving import Server, in_process_settings
@@ -183,35 +181,6 @@ def test_a_mission_shows_what_changed_between_its_revisions(chosen_database, mis
 
 def test_without_a_partner_options_are_offered_for_a_spacecraft_with_batches(two_runs):
     assert "<option selected>SWAS" in two_runs.get("/compare?run=lonely").text
-
-
-def test_the_runs_page_tells_how_far_a_reprocessing_into_the_archive_is(
-    chosen_database, drawn, tmp_path
-):
-    settings = in_process_settings(chosen_database(), archive_folder=tmp_path)
-    now = utc_now()
-    begun = Reprocessing(
-        run="wider",
-        source="live",
-        partitions=365,
-        partitions_done=73,
-        batches=100_000,
-        before=10_000,
-        recorded=9_990,
-        refused=10,
-        started=shifted(now, -100.0).text,
-        updated=now.text,
-        finished=None,
-    )
-    stopped = structs.replace(begun, run="tight", updated=shifted(now, -90.0).text)
-    ended = structs.replace(begun, run="again", partitions_done=365, finished=now.text)
-    for each in (begun, stopped, ended):
-        write_reprocessing(tmp_path, each)
-    with Server(create_app(open_app(settings))) as url:
-        page = text_of(httpx.get(f"{url}/runs", timeout=60))
-    assert "wider live ▸ running 73 of 365 19 990 100 13 min 20 s 10" in page
-    assert "tight live ‖ interrupted" in page
-    assert "again live ● done 365 of 365" in page
 
 
 def test_what_was_recorded_wrongly_is_forgotten_by_name_and_can_be_recorded_anew(

@@ -365,7 +365,8 @@ def forget(parsed: Namespace) -> int:
         parsed.run, parsed.spacecraft, tuple(parsed.batch), tuple(parsed.gyro_block)
     )
     folder = parsed.archive or settings.archive_folder
-    with closing(Store(settings.database, create=False)) as store:
+    off = settings.features_off
+    with closing(Store(settings.database, create=False, features_off=off)) as store:
         with store.reading() as connection:
             total = forgetting.found(connection, selected)
         print(_removal_text(total), file=sys.stderr if parsed.json else sys.stdout)

@@ -226,7 +226,11 @@ def open_products(settings: Settings) -> Iterator[Products]:
     `BadConfiguration` for missions or a database that cannot be used.
     """
     missions = load_missions(*settings.mission_places, shipped=settings.ships_missions)
-    store = Store(settings.database, archive_folder=settings.archive_folder)
+    store = Store(
+        settings.database,
+        archive_folder=settings.archive_folder,
+        features_off=settings.features_off,
+    )
     try:
         with store.reading() as connection:
             missions |= adopted_missions(connection, missions)

@@ -1,1 +1,1 @@
-"""Maintenance of a database: backup, archiving, pruning, copying and verification."""
+"""Maintenance of a database: backup, pruning, copying and verification."""

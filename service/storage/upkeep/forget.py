@@ -12,19 +12,18 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, Table, delete, exists, func, or_, select
+from sqlalchemy import ColumnElement, Connection, Table, delete, exists, or_, select
 from sqlalchemy.exc import IntegrityError
 
 from service.contract.runs import Forgotten
 from service.errors import BadConfiguration, NotFound, shown_value
+from service.feature import SETTING, feature_modules
 from service.observations.schema import LIVE
 from service.storage.projections import rollups
-from service.storage.sql.columns import Row
 from service.storage.sql.definitive_tables import graded_days
-from service.storage.sql.statements import count, rows_of
+from service.storage.sql.statements import count
 from service.storage.sql.tables import (
     archived_batches,
-    archived_hours,
     archived_parts,
     batches,
     gyro_blocks,
@@ -102,14 +101,22 @@ def forget(
 
     `note` is called in the first transaction, and `step` with the number of removed batches and all
     counts.  `archive` is the folder with the archived batches.  Raises `NotFound` as `found` does,
-    and `BadConfiguration` where archived batches are selected and `archive` is not their folder.
+    and `BadConfiguration` where archived batches are selected and `archive` is not their folder, or
+    the archive feature is off.
     """
     with store.reading() as connection:
         total = found(connection, selected)
+    archives = feature_modules("archive", store.features_off)
+    if total.archived_batches and not archives:
+        raise BadConfiguration(
+            f"{total.archived_batches} of the batches are archived, and {SETTING} leaves the "
+            "feature `archive` out, which removes them"
+        )
     if total.archived_batches and archive is None:
         raise BadConfiguration(
             f"{total.archived_batches} of the batches are archived: name the folder of the archive"
         )
+    forget_recorded = partial(_forget_batches, selected=selected)
 
     def forget_days(connection: Connection) -> None:
         while delete_days(connection, _of_days(selected)):
@@ -120,9 +127,10 @@ def forget(
     store.writer.change(forget_days)
     done = 0
     if total.archived_batches and archive is not None:
-        done += _forget_archived(store, archive, selected)
+        chosen = selected.of_batches(archived_batches)
+        done += archives[0].forget_archived(store, archive, chosen, forget_recorded)
         step(done, total)
-    while forgotten := store.writer.change(partial(_forget_batches, selected=selected)):
+    while forgotten := store.writer.change(forget_recorded):
         done += forgotten
         step(done, total)
     blocks = partial(delete_blocks, chosen=selected.of_blocks())
@@ -198,58 +206,6 @@ def _forget_batches(connection: Connection, selected: ForgetFilter) -> int:
     hours = {(row.spacecraft, recorded_utc(row.time).bucket(HOUR_S)) for row in rows}
     rollups.renew(connection, ((spacecraft, selected.run, hour) for spacecraft, hour in hours))
     return len(rows)
-
-
-def _forget_archived(store: Store, folder: Path, selected: ForgetFilter) -> int:
-    """Remove the selected archived batches; returns their number.
-
-    A part whose batches are all selected is deleted.  The batches of any other part are recorded
-    again, and the selected ones deleted there; `acquire archive` archives the rest.
-    """
-    # Archives need pyarrow, which is an extra.
-    from service.storage.archive.folder import claim, locked, manifest_of, parts_of, remove_part
-    from service.storage.archive.rows import read_part
-    from service.storage.upkeep.archiving import forget_part, put_back
-
-    def forget_whole(connection: Connection, row: Row) -> None:
-        own = archived_hours.c.spacecraft == row["spacecraft"], archived_hours.c.run == row["run"]
-        query = select(archived_hours.c.bucket).where(*own, archived_hours.c.part_id == row["id"])
-        hours = set(connection.scalars(query))
-        rollups.lock_position(connection)
-        named = archived_batches.c.part_id == row["id"]
-        ids = connection.scalars(select(archived_batches.c.id).where(named)).all()
-        forget_part(connection, row["id"], row["spacecraft"], row["run"], ids)
-        rollups.renew(connection, ((row["spacecraft"], row["run"], hour) for hour in hours))
-
-    def forget_some(connection: Connection, part: Any, rows: Any) -> None:
-        put_back(connection, folder, part, rows)
-        _forget_batches(connection, selected)
-
-    with locked(folder):
-        with store.reading() as connection:
-            claim(connection, folder)
-            chosen = selected.of_batches(archived_batches)
-            query = select(archived_batches.c.part_id, func.count()).where(*chosen)
-            grouped = connection.execute(query.group_by(archived_batches.c.part_id))
-            counts = dict(map(tuple, grouped))
-            parts = select(archived_parts).where(archived_parts.c.id.in_(counts))
-            known = {row["path"]: row for row in rows_of(connection, parts)}
-        named = {
-            path: (manifest, part) for path, manifest, part in parts_of(folder) if path in known
-        }
-        if missing := sorted(set(known) - set(named)):
-            raise BadConfiguration(f"{folder / missing[0]}: no manifest of the archive names it")
-        for path, (manifest, part) in named.items():
-            row = known[path]
-            if counts[row["id"]] == row["batches"]:
-                store.writer.change(partial(forget_whole, row=row))
-            else:
-                rows = read_part(folder, path, part.sha256)
-                store.writer.change(partial(forget_some, part=part, rows=rows))
-            # Delete files after the database rows: `archive verify` names a surplus file; a missing
-            # one is lost.
-            remove_part(folder, manifest_of(folder, manifest.spacecraft, manifest.day), part)
-    return sum(counts.values())
 
 
 def _forget_run(store: Store, run: str) -> None:

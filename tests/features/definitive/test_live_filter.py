@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from service.errors import Busy, NotFound
+from service.features.archive.archiving import PartFilter, archive, restore
 from service.features.definitive import inputs as recorded_inputs
 from service.features.definitive.carried import CarriedFilter, live_window
 from service.features.definitive.day import definitive_day, window_of
@@ -23,7 +24,6 @@ from service.features.definitive.part import Definitive
 from service.features.definitive.stretches import attitudes_where
 from service.features.products.part import Products
 from service.observations.schema import submission_from_json
-from service.storage.upkeep.archiving import PartFilter, archive, restore
 from service.storage.upkeep.verify import verify
 from service.times import DAY_S, parse_utc
 from service.vectors import ARCSEC_PER_RADIAN, attitude_error_arcsec, matrix_from_quaternion

@@ -9,10 +9,10 @@ from sqlalchemy import func, select, update
 from service.attitude.definitive import packed, unpacked
 from service.cli import main
 from service.errors import NotFound
+from service.features.archive.archiving import PartFilter, archive, restore
 from service.features.definitive.kernels.inputs import AttitudeMeasurements
 from service.features.definitive.part import Definitive
 from service.storage.sql.definitive_tables import graded_blocks, graded_days
-from service.storage.upkeep.archiving import PartFilter, archive, restore
 from service.storage.upkeep.prune import prune
 from service.storage.upkeep.verify import verify
 from service.times import parse_utc

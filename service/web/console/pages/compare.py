@@ -15,7 +15,7 @@ from service.app.runs import MOST_COMPARED
 from service.contract.runs import Comparison, RefusedLine, Replay, RunComparison
 from service.errors import BadBatch
 from service.observations.schema import Key, OptionsIn, RunName
-from service.times import DAY_S, recorded_utc, unix_seconds, utc_now
+from service.times import DAY_S, recorded_utc, unix_seconds
 from service.vectors import Vector
 from service.web.api.batches import COMPARISON_S, SampleSize
 from service.web.console import options
@@ -149,7 +149,7 @@ def _moved(runs: RunComparison | None, result: Comparison | None) -> list[tuple[
 
 @console_page("/runs", "Runs", Policy("read", "nothing"), position=50)
 def runs_page(query: FromQuery[PageQuery], context: ContextDep) -> Response:
-    """Page of all runs, and of replays and reprocessings with their progress.
+    """Page of all runs, and of replays with their progress.
 
     A token that is bound to spacecraft sees their runs, and the replays into these runs.
     """
@@ -159,11 +159,10 @@ def runs_page(query: FromQuery[PageQuery], context: ContextDep) -> Response:
         "runs.html.jinja",
         query.run,
         runs=context.app.runs.all(context.caller.spacecraft),
-        reprocessings=[] if bound else context.app.runs.reprocessings(),
+        panels=context.panels("runs_page"),
         replays=replays,
         later=_later(replays),
         bound=bound,
-        now=utc_now(),
     )
 
 

@@ -10,10 +10,9 @@ from pathlib import Path
 import pytest
 from sqlalchemy import select
 
-from service.storage.archive import folder
+from service.features.archive import archiving, folder
+from service.features.archive.archiving import PartFilter, restore, verify_archive
 from service.storage.sql.tables import archived_batches, batches, results
-from service.storage.upkeep import archiving
-from service.storage.upkeep.archiving import PartFilter, restore, verify_archive
 from service.storage.upkeep.verify import verify
 from service.times import shifted
 from tests.scale import size
@@ -21,7 +20,7 @@ from tests.storage.bulk import put, result_row
 from tests.storage.samples import START
 from tests.waiting import wait_until
 
-CHECKOUT = Path(__file__).parents[2]
+CHECKOUT = Path(__file__).parents[3]
 BATCHES = 300
 GIVE_UP_S = 120.0
 LATER = shifted(START, 10 * 86_400.0)
@@ -29,7 +28,7 @@ LATER = shifted(START, 10 * 86_400.0)
 
 def run_and_kill(database, place, output, parts, after_s):
     """Kill a worker `after_s` after so many parts; False: it had finished."""
-    command = [sys.executable, "-m", "tests.storage.archive_worker", database, place, LATER.text]
+    command = [sys.executable, "-m", "tests.features.archive.worker", database, place, LATER.text]
     with output.open("wb") as stdout:
         worker = subprocess.Popen(command, stdout=stdout, cwd=CHECKOUT)
         wait_until(

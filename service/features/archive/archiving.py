@@ -23,8 +23,7 @@ from sqlalchemy import ColumnElement, Connection, delete, func, insert, select
 from sqlalchemy.exc import IntegrityError
 
 from service.errors import BadConfiguration, BadInput
-from service.observations.schema import fingerprint_of
-from service.storage.archive.folder import (
+from service.features.archive.folder import (
     UNFINISHED,
     Manifest,
     Part,
@@ -44,7 +43,7 @@ from service.storage.archive.folder import (
     write_partition,
     write_settings,
 )
-from service.storage.archive.rows import (
+from service.features.archive.rows import (
     Rows,
     differing,
     from_partition,
@@ -54,6 +53,7 @@ from service.storage.archive.rows import (
     read_rows,
     to_partition,
 )
+from service.observations.schema import fingerprint_of
 from service.storage.projections import rollups, seals
 from service.storage.projections.heads import newest_head
 from service.storage.projections.rollups import keep_share

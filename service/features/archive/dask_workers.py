@@ -21,10 +21,10 @@ from service import __version__
 from service.acquire.prewarm import prewarm_kernels
 from service.errors import BadConfiguration, BadInput, Fault
 from service.extras import require_extra
-from service.ingest import partition_tasks
+from service.features.archive import partition_tasks
+from service.features.archive.folder import write_whole
 from service.ingest.solver_pool import Solver
 from service.ingest.worker_process import WorkerConfig
-from service.storage.archive.folder import write_whole
 
 RETRIES = 3
 """Number of retries of a task that raises; the scheduler itself moves tasks of dead workers."""

@@ -1,6 +1,6 @@
 """`acquire reprocess` on a disk that is full after so many writes to the archive.
 
-    python -m tests.ingest.partitions.full_disk DATABASE FOLDER AFTER
+    python -m tests.features.archive.partitions.full_disk DATABASE FOLDER AFTER
 
 Started with `faulty_disk.c` preloaded.
 """

@@ -11,18 +11,17 @@ from sqlalchemy import func, select
 
 from service.errors import BadBatch, BadConfiguration, Busy, Conflict
 from service.features.alarms.part import Alarms
-from service.ingest import partition_coordinator
+from service.features.archive import archiving, folder, partition_coordinator, reprocessed
+from service.features.archive.part import Reprocessings
 from service.missions.mission import Mission
 from service.observations.schema import submission_from_json
-from service.storage.archive import folder
 from service.storage.projections import rollups
 from service.storage.recording.unsaved_result import Answered
 from service.storage.sql.tables import batches
-from service.storage.upkeep import archiving, reprocessed
 from service.storage.upkeep.prune import prune
 from service.storage.upkeep.verify import verify
 from service.times import parse_utc, shifted
-from tests.ingest.partitions.checks import (
+from tests.features.archive.partitions.checks import (
     BATCHES,
     PART,
     START,
@@ -37,7 +36,7 @@ NOON = shifted(parse_utc(START), 10_000.0)
 
 
 def again(app, place, run="again", **wanted):
-    return app.runs.reprocess_into_archive(run, place, **({"processes": 1} | wanted))
+    return app.part(Reprocessings).reprocess(run, place, **({"processes": 1} | wanted))
 
 
 @pytest.mark.both_databases
@@ -50,7 +49,7 @@ def test_archived_and_recorded_batches_are_run_again_into_the_archive(archived, 
     assert verify(database) == []
     (run,) = [each for each in archived.runs.all() if each.run == "again"]
     assert run.batches == ALL
-    (told,) = archived.runs.reprocessings()
+    (told,) = archived.part(Reprocessings).all()
     assert (told.run, told.partitions_done, told.recorded) == ("again", progress.partitions, ALL)
     assert told.left_s == 0.0
     assert told.finished is not None
@@ -307,8 +306,8 @@ def test_a_damaged_part_ends_it_by_name_and_what_was_done_stays(archived, place)
 
 def test_an_archive_of_another_database_is_refused(archived, place, tmp_path):
     from service.app.factory import open_app
+    from service.features.archive.archiving import PartFilter, restore
     from service.settings import Settings
-    from service.storage.upkeep.archiving import PartFilter, restore
 
     other = open_app(Settings(database=f"sqlite:///{tmp_path / 'other.db'}", replay_processes=0))
     try:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.ingest.partitions.checks import assert_whole
+from tests.features.archive.partitions.checks import assert_whole
 
 
 def test_options_that_do_not_fit_are_refused_by_name(acquire, tmp_path):

@@ -4,9 +4,9 @@ import hashlib
 
 from sqlalchemy import select
 
-from service.storage.archive import folder
+from service.features.archive import folder
+from service.features.archive.archiving import verify_archive
 from service.storage.sql.tables import archived_batches, batches
-from service.storage.upkeep.archiving import verify_archive
 from tests.storage.recount import assert_equal_to_a_recount
 
 START = "1996-01-10T12:00:00.000Z"

@@ -3,8 +3,8 @@
 import sys
 from pathlib import Path
 
+from service.features.archive import archiving
 from service.storage.store import Store
-from service.storage.upkeep import archiving
 from service.times import parse_utc
 
 if __name__ == "__main__":

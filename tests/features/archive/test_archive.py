@@ -14,11 +14,12 @@ import pytest
 from sqlalchemy import func, select, update
 
 from service.errors import BadConfiguration, Busy, Conflict
+from service.features.archive import archiving, folder, rows
+from service.features.archive.archive import ParquetArchive
+from service.features.archive.archiving import PartFilter, restore, verify_archive
+from service.features.archive.rows import WHOLE, Opened, columns_of
 from service.ingest import submit
 from service.observations.schema import OptionsIn
-from service.storage.archive import folder, rows
-from service.storage.archive.reading import ParquetArchive
-from service.storage.archive.rows import WHOLE, Opened, columns_of
 from service.storage.projections import rollups
 from service.storage.sql.columns import metadata
 from service.storage.sql.tables import (
@@ -33,8 +34,6 @@ from service.storage.sql.tables import (
     tracker_values,
 )
 from service.storage.store import Store
-from service.storage.upkeep import archiving
-from service.storage.upkeep.archiving import PartFilter, restore, verify_archive
 from service.storage.upkeep.prune import prune
 from service.storage.upkeep.verify import verify
 from service.times import shifted

@@ -7,14 +7,13 @@ from msgspec import structs
 from sqlalchemy import inspect
 
 from service.errors import Busy, NotAvailable, WrongState
+from service.features.archive import archiving, folder
+from service.features.archive.archiving import PartFilter, restore
 from service.features.products.part import Products
 from service.observations.schema import OptionsIn
-from service.storage.archive import folder
 from service.storage.queries import compare_runs
 from service.storage.queries.pages import ResultFilter, count
 from service.storage.sql.tables import batches, results
-from service.storage.upkeep import archiving
-from service.storage.upkeep.archiving import PartFilter, restore
 from service.times import shifted
 from tests.storage.samples import START
 

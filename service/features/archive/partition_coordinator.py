@@ -18,23 +18,9 @@ import pyarrow as pa
 from sqlalchemy import ColumnElement, Connection, func, select
 
 from service.errors import BadBatch, Fault, shown_value
-from service.ingest.partition_tasks import (
-    PartitionResult,
-    PartitionTask,
-    Source,
-    Wait,
-    Workers,
-    remove_unfinished,
-)
-from service.ingest.reprocess import (
-    ReprocessPlan,
-    ReprocessProgress,
-    after_place,
-    begin_run,
-    not_yet,
-    require_same_settings,
-)
-from service.storage.archive.folder import (
+from service.features.archive.archive import ParquetArchive
+from service.features.archive.archiving import keep_settings
+from service.features.archive.folder import (
     UNFINISHED,
     Part,
     claim,
@@ -43,15 +29,29 @@ from service.storage.archive.folder import (
     manifest_of,
     manifests,
 )
-from service.storage.archive.reading import ParquetArchive
+from service.features.archive.partition_tasks import (
+    PartitionResult,
+    PartitionTask,
+    Source,
+    Wait,
+    Workers,
+    remove_unfinished,
+)
+from service.features.archive.reprocessed import merge, name_part, restore_newest, unmerged
+from service.features.archive.reprocessing import Reprocessing, now_text, write_reprocessing
+from service.ingest.reprocess import (
+    ReprocessPlan,
+    ReprocessProgress,
+    after_place,
+    begin_run,
+    not_yet,
+    require_same_settings,
+)
 from service.storage.archived import PlacedPart, parts_between
 from service.storage.queries.pages import PLACE, Place, ResultFilter, bounds_of
 from service.storage.recording.identity import look_up
 from service.storage.sql.tables import batches, results, rollups_daily
 from service.storage.store import Store
-from service.storage.upkeep.archiving import keep_settings
-from service.storage.upkeep.reprocessed import merge, name_part, restore_newest, unmerged
-from service.storage.upkeep.reprocessing import Reprocessing, now_text, write_reprocessing
 from service.times import DAY_S, bucket_start, parse_utc
 
 REPORT_EVERY_S = 1.0

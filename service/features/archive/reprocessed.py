@@ -17,8 +17,15 @@ from sqlalchemy.exc import IntegrityError
 
 from service.errors import BadConfiguration
 from service.feature import feature_modules
-from service.storage.archive.folder import Part, manifest_of, parts_of, path_of, write_manifest
-from service.storage.archive.rows import Rows, read_part
+from service.features.archive.archiving import (
+    described,
+    hours_of,
+    newest_hours,
+    note_part,
+    put_back,
+)
+from service.features.archive.folder import Part, manifest_of, parts_of, path_of, write_manifest
+from service.features.archive.rows import Rows, read_part
 from service.storage.projections import rollups
 from service.storage.projections.rollups import WHOLE, RecordedResult, insert_share
 from service.storage.recording import events
@@ -29,7 +36,6 @@ from service.storage.sql import tables
 from service.storage.sql.columns import Row
 from service.storage.sql.statements import count, portions
 from service.storage.store import Store
-from service.storage.upkeep.archiving import described, hours_of, newest_hours, note_part, put_back
 from service.times import DAY_S, bucket_start, parse_utc
 
 IDENTITY = ("id", "spacecraft", "run", "batch", "fingerprint")

@@ -1,4 +1,7 @@
-"""Command `acquire archive`: move old batches to Parquet files, verified before deletion."""
+"""Command `acquire archive`: move old batches to Parquet files, verified before deletion.
+
+`acquire reprocess` is extended here, too.
+"""
 
 from argparse import Namespace
 from contextlib import closing
@@ -14,12 +17,14 @@ from service.cli.arguments import (
     settings_of_existing,
 )
 from service.errors import BadConfiguration, BadInput, Fault
+from service.features.archive import reprocess_command
 
 FOLDER = "the archive; default: ACQUIRE_ARCHIVE_FOLDER"
 
 
 def add(commands: Any) -> None:
-    """Declare the command `archive` with `verify` and `restore`."""
+    """Declare `archive` with `verify` and `restore`, and extend `reprocess`."""
+    reprocess_command.extend(commands.choices["reprocess"])
     parser = arguments.add_command(commands, "archive", archive)
     parser.add_argument("--before", metavar="UTC", help="archive batches before this batch time")
     parser.add_argument("--to", type=Path, metavar="FOLDER", help=FOLDER)
@@ -58,8 +63,8 @@ def archive(parsed: Namespace) -> int:
         raise BadInput(Fault("--before", "must not be in the future", before.text))
     folder = _folder(parsed.to, "--to")
     require_extra("tables", "pyarrow", "--to", str(folder))
+    from service.features.archive import archiving
     from service.storage.projections.projector import projected
-    from service.storage.upkeep import archiving
 
     with closing(existing_store(parsed)) as store:
         store.require_writing()
@@ -86,7 +91,7 @@ def verify(parsed: Namespace) -> int:
 
     folder = _folder(parsed.folder, "--archive")
     require_extra("tables", "pyarrow", "--archive", str(folder))
-    from service.storage.upkeep.archiving import verify_archive
+    from service.features.archive.archiving import verify_archive
 
     needed = {} if parsed.database is None else _parts(parsed)
     with progress_bar("batches", "reading") as bar:
@@ -114,7 +119,7 @@ def restore(parsed: Namespace) -> int:
 
     folder = _folder(parsed.folder, "--archive")
     require_extra("tables", "pyarrow", "--archive", str(folder))
-    from service.storage.upkeep import archiving
+    from service.features.archive import archiving
 
     start, end = period_of(parsed)
     selected = archiving.PartFilter(parsed.spacecraft, parsed.run, start, end)

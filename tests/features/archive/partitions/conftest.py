@@ -7,17 +7,14 @@ import pytest
 from sqlalchemy import make_url
 
 from service.app.factory import open_app
+from service.features.archive import archiving
 from service.observations.schema import submission_from_json
 from service.settings import Settings
 from service.simulate.stretches import Pass, Trouble, Troubles
 from service.simulate.telemetry import draw_pass
-from service.storage.upkeep import archiving
 from service.times import parse_utc, shifted
+from tests.features.archive.partitions.checks import BATCHES, CADENCE_S, PART, START
 from tests.fresh_databases import sqlite_at
-from tests.ingest.partitions.checks import BATCHES, CADENCE_S, PART, START
-from tests.storage.conftest import app, make, opened
-
-__all__ = ["app", "make", "opened"]
 
 
 @pytest.fixture(scope="session")
@@ -41,7 +38,7 @@ def place(tmp_path):
 @pytest.fixture(autouse=True)
 def _small_parts(monkeypatch):
     monkeypatch.setattr(archiving, "MOST_BATCHES", PART)
-    monkeypatch.setattr("service.ingest.partition_coordinator.MOST_BATCHES", PART)
+    monkeypatch.setattr("service.features.archive.partition_coordinator.MOST_BATCHES", PART)
 
 
 def fill(app, place, bodies):

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from tests.waiting import wait_until
 
-CHECKOUT = Path(__file__).parents[3]
+CHECKOUT = Path(__file__).parents[4]
 WAIT_S = 240.0
 
 

@@ -1,23 +1,24 @@
-"""Reading of archived batches from the Parquet files of an archive."""
+"""What the record asks of the archive: to read archived batches, and to remove some."""
 
 import logging
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sqlalchemy import Connection
+from sqlalchemy import ColumnElement, Connection
 
 from service.errors import Busy, Fault, NotAvailable
 from service.extras import require_extra
 from service.sky.cache import LruCache
 from service.storage.archived import Archive, Block, PlacedPart, places
 from service.storage.sql.columns import Row
+from service.storage.store import Store
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from service.storage.archive.rows import Opened
+    from service.features.archive.rows import Opened
 
 log = logging.getLogger(__name__)
 
@@ -67,8 +68,8 @@ class ParquetArchive(Archive):
         """Open a batch in an archive part with all its results and their settings."""
 
         def build() -> "Opened":
-            from service.storage.archive.folder import read_settings
-            from service.storage.archive.rows import WHOLE, Opened, columns_of
+            from service.features.archive.folder import read_settings
+            from service.features.archive.rows import WHOLE, Opened, columns_of
 
             own = [[("id", "=", batch_id)], [("batch_id", "=", batch_id)]]
             read = self.read(path, columns_of(WHOLE), own)
@@ -97,7 +98,7 @@ class ParquetArchive(Archive):
         """Open the results of a row group with the columns in `needs`; see `rows.columns_of`."""
 
         def build() -> "Opened":
-            from service.storage.archive.rows import Opened, columns_of
+            from service.features.archive.rows import Opened, columns_of
 
             with self._readable(block.part.path) as file:
                 from pyarrow import parquet
@@ -133,7 +134,7 @@ class ParquetArchive(Archive):
     ) -> "Opened":
         """Open recorded and archived batches in one database, by ids; `needs` as for `open`."""
         require_extra("tables", "pyarrow", "archive", str(self.folder))
-        from service.storage.archive.rows import Opened, columns_of, read_rows
+        from service.features.archive.rows import Opened, columns_of, read_rows
 
         opened = Opened()
         if recorded:
@@ -171,3 +172,21 @@ class ParquetArchive(Archive):
                 "the batches are archived, and the archive cannot be read now: have the folder "
                 "of ACQUIRE_ARCHIVE_FOLDER mounted, or restored from its backup"
             ) from error
+
+
+def open_archive(folder: Path | None) -> ParquetArchive:
+    """Open the archive in a folder; without a folder archived batches cannot be read."""
+    return ParquetArchive(folder)
+
+
+def forget_archived(
+    store: Store,
+    folder: Path,
+    chosen: Collection[ColumnElement[bool]],
+    forget_recorded: Callable[[Connection], object],
+) -> int:
+    """Remove archived batches from the database and the folder; see `forgetting`."""
+    # Archives need pyarrow, which is an extra.
+    from service.features.archive import forgetting
+
+    return forgetting.forget_archived(store, folder, chosen, forget_recorded)

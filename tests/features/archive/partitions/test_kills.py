@@ -8,11 +8,11 @@ from contextlib import ExitStack
 import pytest
 
 from service.errors import BadConfiguration
-from service.ingest import partition_coordinator
-from service.storage.archive.folder import manifests
-from tests.fresh_databases import sqlite_at
-from tests.ingest.partitions.checks import assert_whole, files_of
-from tests.ingest.partitions.processes import (
+from service.features.archive import partition_coordinator
+from service.features.archive.folder import manifests
+from service.features.archive.part import Reprocessings
+from tests.features.archive.partitions.checks import assert_whole, files_of
+from tests.features.archive.partitions.processes import (
     CHECKOUT,
     WAIT_S,
     begin_command,
@@ -22,12 +22,14 @@ from tests.ingest.partitions.processes import (
     run_command,
     scheduler,
 )
+from tests.fresh_databases import sqlite_at
 from tests.scale import size
 from tests.storage.test_faulty_disk import faulty_disk
 from tests.waiting import wait_until
 
 __all__ = ["faulty_disk"]
 
+FULL_DISK = "tests.features.archive.partitions.full_disk"
 WORKER_KILLS, COORDINATOR_KILLS, FAULTS = 200, 20, 50
 MOST_BATCHES = partition_coordinator.MOST_BATCHES
 
@@ -63,7 +65,7 @@ def undisturbed(folders, opened, monkeypatch):
     database, place = folders()
     monkeypatch.setattr(partition_coordinator, "MOST_BATCHES", MOST_BATCHES)
     app = opened(database=database, archive_folder=place)
-    app.runs.reprocess_into_archive("again", place, processes=1)
+    app.part(Reprocessings).reprocess("again", place, processes=1)
     app.close()
     return files_of(place, "again")
 
@@ -130,7 +132,7 @@ def test_a_scheduler_that_goes_is_told_and_the_rest_is_done_without(
 
 @pytest.mark.parametrize("package", ["attitude-acquisition", "numba", "numpy", "pyarrow"])
 def test_a_worker_of_another_version_is_refused(missions, package):
-    from service.ingest import dask_workers
+    from service.features.archive import dask_workers
     from service.ingest.worker_process import WorkerConfig
 
     versions = dask_workers.versions() | {package: "1.0"}
@@ -197,7 +199,14 @@ def test_a_full_disk_stops_it_with_a_message_and_it_goes_on(
         while not ended_well:
             after = str(int(rng.integers(0, 40)))
             ran = subprocess.run(
-                [sys.executable, "-m", "tests.ingest.partitions.full_disk", database, place, after],
+                [
+                    sys.executable,
+                    "-m",
+                    FULL_DISK,
+                    database,
+                    place,
+                    after,
+                ],
                 env={"LD_PRELOAD": str(faulty_disk), "FAULTY_FOLDER": str(place)} | environment(),
                 cwd=CHECKOUT,
                 capture_output=True,

@@ -23,24 +23,24 @@ from sqlalchemy import Table
 from service import __version__
 from service.acquire import Acquisition
 from service.errors import AcquisitionError, BadConfiguration
-from service.ingest.local_workers import LocalWorkers, WorkerLost
-from service.ingest.reprocess import RefusedBatch, submission_again
-from service.ingest.solver_pool import Solver, mission_in_input
-from service.ingest.worker_process import WorkerConfig
-from service.observations.schema import Submission
-from service.storage.archive.folder import (
+from service.features.archive.folder import (
     day_folder,
     encoded,
     read_partition,
     whole_content,
     write_first,
 )
-from service.storage.archive.rows import CHILDREN, Rows, from_partition, schema_of, to_partition
+from service.features.archive.reprocessed import RunPart, run_part
+from service.features.archive.rows import CHILDREN, Rows, from_partition, schema_of, to_partition
+from service.ingest.local_workers import LocalWorkers, WorkerLost
+from service.ingest.reprocess import RefusedBatch, submission_again
+from service.ingest.solver_pool import Solver, mission_in_input
+from service.ingest.worker_process import WorkerConfig
+from service.observations.schema import Submission
 from service.storage.recording.ids import derived_ulid
 from service.storage.recording.unsaved_result import UnsavedResult, unsaved_submission
 from service.storage.sql.columns import Row
 from service.storage.sql.tables import batches, results
-from service.storage.upkeep.reprocessed import RunPart, run_part
 from service.times import recorded_utc
 
 COLUMNS = ("id", "batch_id", "batch", "received", "created", "input", "options", "current")

@@ -23,7 +23,7 @@ from sqlalchemy import Connection, StaticPool, Table, create_engine
 from sqlalchemy.schema import CreateIndex, CreateTable
 from sqlalchemy.types import TypeEngine
 
-from service.storage.archive.folder import Settings, read_partition, whole_content
+from service.features.archive.folder import Settings, read_partition, whole_content
 from service.storage.sql import tables
 from service.storage.sql.columns import PackedText
 from service.storage.sql.statements import insert_all, portions

@@ -1,1 +1,0 @@
-"""Archive of old batches in Parquet files beside the database."""
