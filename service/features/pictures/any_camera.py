@@ -17,7 +17,6 @@ from service.settings import Settings
 if TYPE_CHECKING:
     from argparse import _ArgumentGroup as ArgumentGroup  # it has no public name
 
-    from service.features.pictures.blind.picture import PictureResult
     from service.features.pictures.frames.frame import Frame
 
 FEW_NAMES = 12
@@ -71,9 +70,11 @@ def solve_pictures(parsed: Namespace, settings: Settings) -> int:
     """Solve each picture file and print its result; returns 1 if any fails, otherwise 0."""
     from service.features.pictures.blind.picture import blind_sky, solve_picture
     from service.features.pictures.blind.square_pixels import require_ratio
+    from service.features.pictures.overlay import overlay_of
     from service.features.pictures.records import picture_of
     from service.sky.catalog.star_catalog import open_catalog
 
+    targets = overlay_files(parsed)
     sky, solver = blind_sky(open_catalog(settings.catalog))
     read = picture_reader(parsed.dark, settings, parsed.image)
     failed = 0
@@ -94,7 +95,8 @@ def solve_pictures(parsed: Namespace, settings: Settings) -> int:
         report.pop("overlay_png")
         unwritten = None
         try:
-            report["overlay"] = str(_write_overlay(parsed, file, result))
+            write_overlay(parsed, targets[file], overlay_of(result, file.name))
+            report["overlay"] = str(targets[file])
         except OSError as error:
             unwritten = f"the picture cannot be written: {error.filename}: {error.strerror}"
         print(json.dumps(report) if parsed.json else _summary(file, report))
@@ -199,12 +201,37 @@ def _matched(report: dict[str, Any]) -> str:
     )
 
 
-def _write_overlay(parsed: Namespace, file: Path, result: "PictureResult") -> Path:
-    from service.features.pictures.overlay import overlay_of
+def overlay_files(parsed: Namespace) -> dict[Path, Path]:
+    """The file that each picture's overlay is written to, by the picture's file.
 
-    target: Path = parsed.overlay or Path(f"{file.stem}-stars.png")
-    if parsed.overlay is not None and (len(parsed.files) > 1 or target.is_dir()):
-        target.mkdir(parents=True, exist_ok=True)
-        target = target / f"{file.stem}.png"
-    target.write_bytes(overlay_of(result, file.name))
-    return target
+    `--overlay` names a file, or a folder for several pictures; without it FILE-stars.png in the
+    current folder. Raises `BadInput` where an overlay would replace another, or a picture.
+    """
+    overlay: Path | None = parsed.overlay
+    is_folder = overlay is not None and (len(parsed.files) > 1 or overlay.is_dir())
+    read = [*parsed.files, *filter(None, [parsed.dark])]
+    pictures = {file.resolve(): file for file in read}
+    targets: dict[Path, Path] = {}
+    owners: dict[Path, Path] = {}
+    for file in parsed.files:
+        if overlay is None:
+            target = Path(f"{file.stem}-stars.png")
+        else:
+            target = overlay / f"{file.stem}.png" if is_folder else overlay
+        replaced = pictures.get(target.resolve())
+        if replaced is not None:
+            message = f"would replace the picture {replaced}; name another place with --overlay"
+            raise BadInput(Fault("--overlay", message, shown_value(str(target))))
+        owner = owners.setdefault(target.resolve(), file)
+        if owner.resolve() != file.resolve():
+            message = f"would be the overlay of both {owner} and {file}; send them one by one"
+            raise BadInput(Fault("--overlay", message, shown_value(str(target))))
+        targets[file] = target
+    return targets
+
+
+def write_overlay(parsed: Namespace, target: Path, picture: bytes) -> None:
+    """Write an overlay to its file, for several pictures into a folder that is made."""
+    if len(parsed.files) > 1:
+        target.parent.mkdir(parents=True, exist_ok=True)
+    target.write_bytes(picture)

@@ -95,6 +95,7 @@ def run(parsed: Namespace) -> int:
     if parsed.database is not None and not parsed.in_process:
         message = "goes with --in-process; a running service has its own"
         raise BadInput(Fault("--database", message, shown_value(parsed.database)))
+    targets = any_camera.overlay_files(parsed) if parsed.overlay else {}
     refused = 0
     with frame_submitter(parsed, arguments.settings_of(parsed)) as submitter:
         for file in parsed.files:
@@ -107,7 +108,8 @@ def run(parsed: Namespace) -> int:
             answer = json.loads(body)
             print(body.decode() if parsed.json else _summary(file, answer))
             if parsed.overlay is not None:
-                _write_overlay(parsed, file, submitter.overlay(answer["id"]))
+                picture = submitter.overlay(answer["id"])
+                any_camera.write_overlay(parsed, targets[file], picture)
     return 1 if refused else 0
 
 
@@ -156,14 +158,6 @@ def _summary(file: Path, answer: dict[str, Any]) -> str:
         sigmas = " ".join(f"{math.sqrt(covariance[k][k]):.2f}" for k in range(3))
         lines.append(f"  {attitude['status']}  {quaternion}  sigma {sigmas} arcsec")
     return "\n".join([*lines, *(f"  {each}" for each in answer["warnings"]), f"  {answer['id']}"])
-
-
-def _write_overlay(parsed: Namespace, file: Path, picture: bytes) -> None:
-    target: Path = parsed.overlay
-    if len(parsed.files) > 1 or target.is_dir():
-        target.mkdir(parents=True, exist_ok=True)
-        target = target / f"{file.stem}.png"
-    target.write_bytes(picture)
 
 
 FRAME_TYPE = "application/octet-stream"

@@ -210,6 +210,37 @@ def test_the_command_prints_its_attitude_where_the_picture_cannot_be_written(tmp
     assert f"cannot be written: {target}: No such file" in told.err
 
 
+@pytest.mark.parametrize("spacecraft", [(), ("--spacecraft", "IMAGER", "--in-process")])
+@pytest.mark.parametrize(
+    ("files", "overlay", "message"),
+    [
+        (("a/1.fits", "b/1.fits"), "out", "both a/1.fits and b/1.fits"),
+        (("a/1.fits", "a/1.tif"), "out", "both a/1.fits and a/1.tif"),
+        (("a/1.png", "a/2.fits"), "a", "would replace the picture a/1.png"),
+        (("a/1.png",), "a", "would replace the picture a/1.png"),
+        (("a/1.png",), "a/1.png", "would replace the picture a/1.png"),
+        (("a/2.fits", "2.png"), ".", "would replace the picture 2.png"),
+    ],
+)
+def test_no_overlay_replaces_another_or_a_picture(
+    spacecraft, files, overlay, message, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    for file in files:
+        Path(file).parent.mkdir(exist_ok=True)
+        Path(file).write_bytes(b"a picture")
+    assert main(["frame", *files, "--overlay", overlay, *spacecraft]) == 2
+    assert message in capsys.readouterr().err
+    assert all(Path(file).read_bytes() == b"a picture" for file in files)
+    assert not Path("out").exists()
+
+
+def test_pictures_of_one_name_have_no_overlays_of_one_name(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["frame", "a/1.fits", "b/1.fits"]) == 2
+    assert "both a/1.fits and b/1.fits" in capsys.readouterr().err
+
+
 def test_the_command_says_what_it_found_as_json(tmp_path, capsys):
     picture = FOLDER / "cedarsolve-tree.jpg"
     out = tmp_path / "out.png"
