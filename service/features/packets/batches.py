@@ -90,6 +90,7 @@ class GyroRates:
         self._names = names
         self._turn = 1 << gyro.counter_bits
         self._last: tuple[int, tuple[int, ...]] | None = None
+        self._rates: list[float] | None = None
 
     def add(self, values: Mapping[str, Any], moment: clock.Moment) -> list[float] | None:
         """Body rates in deg/s at a packet; None if its angle has no recent predecessor."""
@@ -99,15 +100,19 @@ class GyroRates:
             return [count * scale for count, scale in zip(counts, gyro.scale_deg, strict=True)]
         angles = tuple(clock.whole(values, name) for name in self._names)
         before, self._last = self._last, (moment.tai_ns, angles)
+        if self._last == before:
+            # The packet was sent or stored twice, or several packets have one sample.
+            return self._rates
+        self._rates = None
         if before is None:
             return None
         passed_s = (moment.tai_ns - before[0]) / clock.NS
-        if not 0.0 < passed_s <= gyro.max_gap_s:
-            return None
-        return [
-            counted_change(now - then, self._turn) * scale / passed_s
-            for now, then, scale in zip(angles, before[1], gyro.scale_deg, strict=True)
-        ]
+        if 0.0 < passed_s <= gyro.max_gap_s:
+            self._rates = [
+                counted_change(now - then, self._turn) * scale / passed_s
+                for now, then, scale in zip(angles, before[1], gyro.scale_deg, strict=True)
+            ]
+        return self._rates
 
 
 class Held:
@@ -385,7 +390,7 @@ class MeasurementMaker:
         self, columns: MeasurementColumns, packet: SpacePacket, values: Mapping[str, Any]
     ) -> dict[str, Any] | None:
         table = columns.table
-        if table.valid is not None and not clock.flag(values, table.valid, table.valid_labels):
+        if table.valid is not None and not clock.flag(values, table.valid, columns.valid_labels):
             return None
         quaternion = quaternion_in(values, columns.quaternion, table)
         if quaternion is None:

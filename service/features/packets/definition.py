@@ -10,7 +10,7 @@ its own location, are refused by line.
 import io
 import math
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -357,9 +357,9 @@ class PacketFault(Exception):
 
 @dataclass(frozen=True)
 class ParameterKind:
-    """Kind of value of a parameter; for enumerations the labels with their numbers.
+    """Kind of value of a parameter; for enumerations and named booleans the labels with numbers.
 
-    The number is None if the labels stand for texts.
+    The number is None if a label stands for a text, or for zero and another number.
     """
 
     kind: Literal["number", "boolean", "enumerated", "text", "binary"]
@@ -373,7 +373,9 @@ class PacketDefinition:
         """Load XTCE text; raises `BadFile` naming the file, `NotAvailable` without the package."""
         require_extra("packets", "space_packet_parser", "packets", name)
         self.name = name
-        self._containers = _loaded(normalised_xtce(text, name), name)
+        normalised = normalised_xtce(text, name)
+        self._containers = _loaded(normalised, name)
+        named = _named_booleans(normalised)
         if root_container not in self._containers:
             known = ", ".join(list(self._containers)[:20])
             message = (
@@ -383,7 +385,7 @@ class PacketDefinition:
         self._root = self._containers[root_container]
         _require_bounded(self._containers, name)
         self.parameters: dict[str, ParameterKind] = {
-            entry.name: _kind_of(entry.parameter_type)
+            entry.name: _kind_of(entry.parameter_type, named)
             for each in self._containers.values()
             for entry in each.entry_list
             if not hasattr(entry, "entry_list")
@@ -470,18 +472,38 @@ def _entries(container: Any, sizes: dict[str, int]) -> int:
     return min(sizes[container.name], MAX_ENTRIES + 1)
 
 
-def _kind_of(parameter_type: Any) -> ParameterKind:
+def _named_booleans(normalised: bytes) -> dict[str, dict[str, float | None]]:
+    """Labels of boolean types whose XTCE names them, which the library leaves out, by type."""
+    from lxml import etree
+
+    found = {}
+    for kind in etree.fromstring(normalised).iter(_named("BooleanParameterType")):
+        if "zeroStringValue" in kind.attrib or "oneStringValue" in kind.attrib:
+            zero, one = kind.get("zeroStringValue", "False"), kind.get("oneStringValue", "True")
+            found[str(kind.get("name"))] = _labels([(0, zero), (1, one)])
+    return found
+
+
+def _labels(entries: Iterable[tuple[Any, str]]) -> dict[str, float | None]:
+    labels: dict[str, float | None] = {}
+    for raw, label in entries:
+        # A value of a text encoding is bytes.
+        number = raw if isinstance(raw, int | float) else None
+        if label in labels and bool(labels[label]) != bool(number):
+            number = None
+        labels[label] = number
+    return labels
+
+
+def _kind_of(
+    parameter_type: Any, named_booleans: Mapping[str, Mapping[str, float | None]]
+) -> ParameterKind:
     name = type(parameter_type).__name__.removesuffix("ParameterType")
     encoding = type(parameter_type.encoding).__name__
     if name == "Enumerated":
-        # A value of a text encoding is bytes.
-        labels = {
-            label: raw if isinstance(raw, int | float) else None
-            for raw, label in parameter_type.enumeration.items()
-        }
-        return ParameterKind("enumerated", labels)
+        return ParameterKind("enumerated", _labels(parameter_type.enumeration.items()))
     if name == "Boolean":
-        return ParameterKind("boolean")
+        return ParameterKind("boolean", named_booleans.get(parameter_type.name, {}))
     if encoding == "StringDataEncoding":
         return ParameterKind("text")
     return ParameterKind("binary" if encoding == "BinaryDataEncoding" else "number")

@@ -3,7 +3,7 @@
 import difflib
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from service.errors import BadInput, Fault, shown_value
@@ -49,6 +49,7 @@ class MeasurementColumns:
     """Packet parameters of an attitude measured by a tracker."""
 
     table: PacketMeasurement
+    valid_labels: tuple[str, ...] | None
     quaternion: tuple[str, ...]
     sigma: tuple[str, ...]
     covariance: tuple[str, ...]
@@ -101,7 +102,27 @@ def packet_map(table: Packets, definition: PacketDefinition) -> PacketMap:
                 faults.append(Fault(f"packets.{key}", message, shown_value(name)))
     if faults:
         raise BadInput(faults[:20])
-    return found
+    return _with_digits(found, definition)
+
+
+def _with_digits(found: PacketMap, definition: PacketDefinition) -> PacketMap:
+    """The map with digits in place of the labels of booleans, whose values have none."""
+
+    def digits(names: Iterable[str], labels: tuple[str, ...] | None) -> tuple[str, ...] | None:
+        kinds = [definition.parameters[name] for name in names]
+        if labels is None or not any(each.kind == "boolean" for each in kinds):
+            return labels
+        return tuple(str(kinds[0].labels[label]) for label in labels)
+
+    trackers = tuple(
+        replace(each, valid_labels=digits(each.valid or (), each.valid_labels))
+        for each in found.trackers
+    )
+    measurements = []
+    for each in found.measurements:
+        labels = digits(filter(None, [each.table.valid]), each.table.valid_labels)
+        measurements.append(replace(each, valid_labels=labels))
+    return replace(found, trackers=trackers, measurements=tuple(measurements))
 
 
 def _labels_of(key: str, found: PacketMap) -> tuple[str, ...] | None:
@@ -110,7 +131,7 @@ def _labels_of(key: str, found: PacketMap) -> tuple[str, ...] | None:
         return None
     if table == "trackers":
         return found.trackers[int(index)].valid_labels
-    return found.measurements[int(index)].table.valid_labels
+    return found.measurements[int(index)].valid_labels
 
 
 _NO = frozenset(
@@ -132,14 +153,15 @@ _YES = frozenset(
 def _misfit(key: str, kind: ParameterKind, labels: tuple[str, ...] | None) -> str | None:
     """Reason why a kind of parameter does not fit a key of the table; None if it fits."""
     if key == "batch":
-        return "is a boolean; a number or a text is needed" if kind.kind == "boolean" else None
+        is_many = kind.kind in ("number", "text")
+        return None if is_many else f"{_said(kind)}; a number or a text is needed"
     if not key.endswith(".valid"):
         return None if kind.kind == "number" else f"{_said(kind)}; a number is needed"
     if labels is None:
-        if kind.kind == "enumerated":
-            return _unclear_labels(kind.labels)
+        if kind.labels:
+            return _unclear_labels(kind)
         return None if kind.kind in ("number", "boolean") else f"{_said(kind)}; give valid_labels"
-    if kind.kind == "enumerated":
+    if kind.labels:
         unknown = [label for label in labels if label not in kind.labels]
         known = ", ".join(list(kind.labels)[:20])
         return f"has no label {unknown[0]!r} of valid_labels; it has {known}" if unknown else None
@@ -150,8 +172,9 @@ def _said(kind: ParameterKind) -> str:
     return f"is {'an' if kind.kind == 'enumerated' else 'a'} {kind.kind} parameter"
 
 
-def _unclear_labels(labels: Mapping[str, float | None]) -> str | None:
+def _unclear_labels(kind: ParameterKind) -> str | None:
     """Reason why the numbers of labels do not show which of them mean valid; None if they do."""
+    labels = kind.labels
     words = {label: label.strip().lower().replace(" ", "_").replace("-", "_") for label in labels}
     set_labels = [label for label, raw in labels.items() if raw != 0]
     wrong = [label for label in set_labels if labels[label] is None or words[label] in _NO]
@@ -160,8 +183,11 @@ def _unclear_labels(labels: Mapping[str, float | None]) -> str | None:
         wrong += [label for label in set_labels if words[label] not in _YES]
     if not wrong:
         return None
-    shown = ", ".join(f"{label} = {raw}" for label, raw in list(labels.items())[:20])
-    return f"is enumerated, {shown}: give valid_labels, the labels that mean that it holds one"
+    shown = ", ".join(
+        label if raw is None else f"{label} = {raw}" for label, raw in list(labels.items())[:20]
+    )
+    word = "a boolean" if kind.kind == "boolean" else "enumerated"
+    return f"is {word}, {shown}: give valid_labels, the labels that mean that it holds one"
 
 
 def packet_mission(missions: Mapping[str, Mission], name: str | None) -> Mission:
@@ -222,6 +248,7 @@ def _columns(table: PacketTracker) -> TrackerColumns:
 def _measurement(table: PacketMeasurement) -> MeasurementColumns:
     return MeasurementColumns(
         table=table,
+        valid_labels=table.valid_labels,
         quaternion=element_names(table.quaternion, 4),
         sigma=element_names(table.sigma, 3) if table.sigma else (),
         covariance=element_names(table.covariance, 6) if table.covariance else (),

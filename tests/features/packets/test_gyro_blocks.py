@@ -10,10 +10,13 @@ import pytest
 from service.app.factory import open_app
 from service.cli import main
 from service.errors import BadConfiguration, BadInput
+from service.features.packets.batches import GyroRates
+from service.features.packets.clock import Moment
 from service.features.packets.definition import PacketDefinition
 from service.features.packets.reader import PacketReader
 from service.gyro.blocks import block_from_line
 from service.missions.mission import SHIPPED_FOLDER
+from service.missions.packets import PacketGyro
 from service.settings import Settings
 from service.simulate.stretches import Pass
 from service.simulate.telemetry import GyroWanted, draw_pass, with_gyro
@@ -268,3 +271,21 @@ def test_stars_of_a_packet_are_kept_though_its_gyro_is_not(missions, sky):
     lines = read([packet(fields(drawn), 0, APID)], reader)
     assert [each.fault is None for each in lines] == [True, False]
     assert reader.totals().batches == 1
+
+
+def test_counts_that_were_sent_twice_keep_the_rates_of_their_step():
+    gyro = PacketGyro(counts=("G0", "G1", "G2"), scale_deg=(0.1, 0.1, 0.1))
+    steps = [(0, (0, 0, 0)), (1, (1, 2, 3)), (2, (3, 6, 9)), (40, (3, 6, 9))]
+
+    def rates(moments):
+        turning = GyroRates(gyro, ("G0", "G1", "G2"))
+        return [
+            turning.add(dict(zip(("G0", "G1", "G2"), counts, strict=True)), Moment("", s * 10**9))
+            for s, counts in moments
+        ]
+
+    once = rates(steps)
+    assert [each is None for each in once] == [True, False, False, True]
+    assert rates([each for step in steps for each in (step, step)]) == [
+        each for rate in once for each in (rate, rate)
+    ]

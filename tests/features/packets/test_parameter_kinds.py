@@ -84,6 +84,30 @@ def test_a_boolean_flag_counts_where_it_is_true():
     assert [each.time for each in read(described=BOOLEAN)[0]] == [each.time for each in read()[0]]
 
 
+def named(zero, one):
+    """A boolean whose two values have names."""
+    names = f'name="VT" zeroStringValue="{zero}" oneStringValue="{one}"'
+    return BOOLEAN.replace('name="VT"', names)
+
+
+@pytest.mark.parametrize(
+    ("described", "label"),
+    [(named("NO", "YES"), None), (named("BAD", "SET"), "SET"), (named("OK", "BAD"), "BAD")],
+)
+def test_a_boolean_with_names_is_judged_by_them(described, label):
+    more = "" if label is None else f'valid_labels = ["{label}"]'
+    batches, _ = read(TABLE_OF_FLAG + more, described)
+    assert [each.time for each in batches] == [each.time for each in read()[0]]
+
+
+def test_the_name_of_zero_may_mean_valid():
+    found = [
+        each.time for each in read(TABLE_OF_FLAG + 'valid_labels = ["OK"]', named("OK", "BAD"))[0]
+    ]
+    assert len(found) == 3
+    assert not set(found) & {each.time for each in read()[0]}
+
+
 def test_without_labels_a_flag_by_number_is_as_before():
     number = XTCE.replace(
         'name="VALID" parameterTypeRef="VT"', 'name="VALID" parameterTypeRef="U8"'
@@ -99,6 +123,9 @@ def test_without_labels_a_flag_by_number_is_as_before():
         (labelled(VALID=0, INVALID=1), "", "VALID = 0, INVALID = 1: give valid_labels"),
         (labelled(OFF=0, ACQUIRING=1, TRACKING=2), "", "give valid_labels"),
         (XTCE, 'valid_labels = ["GOOD"]', "has no label 'GOOD' of valid_labels; it has INVALID"),
+        (named("VALID", "INVALID"), "", "is a boolean, VALID = 0, INVALID = 1: give valid_labels"),
+        (named("NO", "YES"), 'valid_labels = ["GOOD"]', "has no label 'GOOD' of valid_labels"),
+        (XTCE.replace('"INVALID"', '"VALID"'), "", "is enumerated, VALID: give valid_labels"),
         (BOOLEAN, 'valid_labels = ["VALID"]', "is a boolean parameter and has no labels"),
     ],
 )
@@ -107,6 +134,12 @@ def test_labels_that_do_not_tell_are_refused_before_any_packet(described, more, 
         read(TABLE_OF_FLAG + more, described)
     assert "packets.measurements.0.valid" in str(refusal.value)
     assert words in str(refusal.value)
+
+
+@pytest.mark.parametrize("described", [XTCE, BOOLEAN])
+def test_a_flag_names_no_batch(described):
+    with pytest.raises(BadInput, match=r"packets.batch: .*; a number or a text is needed"):
+        read(TABLE_OF_FLAG.replace("[packets]\n", '[packets]\nbatch = "VALID"\n'), described)
 
 
 PARAMETERS = {
