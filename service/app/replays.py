@@ -25,7 +25,7 @@ from service.ingest.submit import SubmissionService
 from service.ingest.worker_process import WorkerConfig
 from service.observations.decompress import Coding, Line, unpacked_lines
 from service.observations.input_formats import NDJSON, input_formats
-from service.observations.telemetry import read_lines, require_telemetry
+from service.observations.telemetry import is_utf16, read_lines, require_telemetry
 from service.storage.queries import replay_rows
 from service.storage.recording.ids import unguessable_ulid
 from service.storage.recording.results import set_run_alarms
@@ -149,6 +149,9 @@ class Replays:
             if archive is None and form.coding == "identity":
                 file.flush()
                 require_telemetry(Path(file.name), form.form, "body")
+                if is_utf16(Path(file.name)):
+                    # The newlines were counted as bytes.
+                    options["total"] = None
             replay = self._new(run, options, drop=self._spool.drop)
             on_failure.callback(replay.release_slot)
             about = SpooledReplay(
@@ -215,10 +218,12 @@ class Replays:
     def _lines_of(
         self, file: IO[bytes], about: SpooledReplay, replay: RunningReplay
     ) -> Iterable[bytes | Line]:
-        if about.form_name == NDJSON:
+        path = self._spool.path(about.id)
+        is_plain_wide = about.coding == "identity" and is_utf16(path)
+        if about.form_name == NDJSON and not is_plain_wide:
             return unpacked_lines(file, about.coding, about.longest_bytes, replay.require_going_on)
         file.close()
-        return read_lines(self._spool.path(about.id), about.form_name)
+        return read_lines(path, about.form_name)
 
     def _archive_lines(self, file: IO[bytes], form: UploadForm) -> CountedLines | None:
         """Open an uploaded archive as lines of batches; None for an upload of lines.

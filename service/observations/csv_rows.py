@@ -396,7 +396,10 @@ class BatchRows(JoinedRows):
         if any(row.get(column) for column in STAR_COLUMNS[1:]):
             stars.append(star_of(row))
         if lines := lines_of(row):
-            if row["tracker"] in self.rasters:
+            if (before := self.rasters.get(row["tracker"])) == lines:
+                words = f"a row of {row['tracker']} repeats its raster, and was counted once"
+                self.fields["remarks"] = [f"repeated_rows: {words}"]
+            elif before is not None:
                 raise BadCell(next(iter(lines)), "has lines of the tracker a second time")
             self.rasters[row["tracker"]] = lines
 

@@ -17,6 +17,7 @@ from service.observations.decompress import Line
 from service.observations.input_formats import NDJSON, telemetry_format, telemetry_formats
 
 _LOOKED_AT_BYTES = 1 << 16
+_UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _PACKED = {b"\x1f\x8b": ("gzip", "gunzip"), b"\x28\xb5\x2f\xfd": ("zstd", "unzstd")}
 
 
@@ -56,6 +57,12 @@ def require_telemetry(path: Path, form: str | None = None, field: str | None = N
             ) from None
 
 
+def is_utf16(path: Path) -> bool:
+    """True if a file begins with a byte order mark of UTF-16."""
+    with path.open("rb") as file:
+        return file.read(2) in _UTF16
+
+
 def _not_telemetry(start: bytes, form: str) -> str | None:
     """A description of a file that is no telemetry, by its first bytes; None for telemetry."""
     if not start.strip():
@@ -88,13 +95,13 @@ def _opened(source: Path | BinaryIO, form: str) -> Iterator[BinaryIO]:
             return
         start = stream.read(_LOOKED_AT_BYTES)
         stream.seek(0)
-        is_utf16 = start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
-        if not is_utf16 and not (form == "csv" and b"\r" in start and b"\n" not in start):
+        is_wide = start.startswith(_UTF16)
+        if not is_wide and not (form == "csv" and b"\r" in start and b"\n" not in start):
             yield stream
             return
         with tempfile.TemporaryFile() as copy:
             # The default `newline` turns every kind of line end into a line feed.
-            text = io.TextIOWrapper(stream, "utf-16" if is_utf16 else "utf-8", "surrogateescape")
+            text = io.TextIOWrapper(stream, "utf-16" if is_wide else "utf-8", "surrogateescape")
             try:
                 while piece := text.read(_LOOKED_AT_BYTES):
                     copy.write(piece.encode("utf-8", "surrogateescape"))

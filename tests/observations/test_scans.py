@@ -298,6 +298,22 @@ def test_the_lines_of_the_largest_raster_are_one_cell(tmp_path, rng):
     assert BatchIn.model_validate_json(line.body) == checked
 
 
+def test_a_raster_in_repeated_rows_counts_once(tmp_path):
+    """A file that was appended to itself; another raster of the tracker is refused."""
+    head = "spacecraft,batch,time,tracker,column_counts,row_counts"
+    row = "SCANNER,1,1996-01-10T12:00:00Z,RASTER,1 2 3,4 5 6"
+    path = tmp_path / "twice.csv"
+    path.write_text("\n".join((head, row, head, row)))
+    (line,) = read_lines(path)
+    found = json.loads(line.body)
+    raster = {"tracker": "RASTER", "stars": [], "column_counts": [1, 2, 3], "row_counts": [4, 5, 6]}
+    assert found["observations"] == [raster]
+    assert "counted once" in found["remarks"][0]
+    path.write_text("\n".join((head, row, row.replace("4 5", "5 4"))))
+    (line,) = read_lines(path)
+    assert "a second time" in line.fault.message
+
+
 @pytest.mark.parametrize(
     ("cell", "message"), [("1 2 x", "must be a number"), ("1 1e999 3", "must be a finite number")]
 )

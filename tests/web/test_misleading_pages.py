@@ -325,6 +325,14 @@ def test_a_csv_file_is_replayed_as_the_command_replays_it(client, run, tmp_path)
         assert {each["batch"] for each in found} == {each["batch"] for each in expected}
 
 
+def test_lines_of_json_are_replayed_in_each_coding_that_the_command_reads(client, run, batch):
+    lines = "".join(json.dumps(batch | {"batch": f"b{k}"}) + "\n" for k in range(2))
+    for k, body in enumerate(map(lines.encode, ("utf-8-sig", "utf-16", "utf-8"))):
+        replay = ended(client, send(client, f"{run}-{k}", body, "application/x-ndjson"))
+        assert (replay["state"], replay["counts"]["new"]) == ("done", 2), replay
+        assert replay["lines"]["total"] in (None, 2)
+
+
 def test_a_csv_file_that_is_sent_as_lines_is_refused_at_once(client, run):
     answer = send(client, run, CSV.encode(), "application/x-ndjson")
     assert answer.status_code == 422
