@@ -60,6 +60,21 @@ def test_trails_are_named_and_rates_that_contradict_them_too(missions, sky):
     assert [each for each in doubted if each.startswith("body_rates_deg_per_s: ")]
 
 
+def test_rates_of_short_trails_and_of_another_direction_are_told_apart(missions, sky):
+    def doubts(drawn, rates):
+        remarks = submitted(missions["IMAGER"], drawn, body_rates_deg_per_s=rates).frame.remarks
+        return "".join(each for each in remarks if each.startswith("body_rates_deg_per_s: "))
+
+    (short,) = drawn_frames(missions["IMAGER"], sky, 2.0, 1, seed=5)
+    x, y, z = short.known["body_rates_deg_per_s"]
+    assert doubts(short, [x, y, z]) == ""
+    (long,) = drawn_frames(missions["IMAGER"], sky, 2.0, 1)
+    x, y, z = long.known["body_rates_deg_per_s"]
+    assert doubts(long, [x, y, z]) == ""
+    assert "in another direction" in doubts(long, [-x, y, z]) + doubts(long, [x, y, -z])
+    assert "are zero or not given, and the frame shows" in doubts(long, None)
+
+
 def test_two_images_of_each_star_are_refused_as_trailed(missions, sky):
     (drawn,) = drawn_frames(missions["IMAGER"], sky, 0.0, 1)
     level = np.median(drawn.counts)

@@ -101,18 +101,24 @@ def _by_rates(
     tracker: Tracker, camera: Camera, rates_deg_per_s: Vector, exposure_s: float
 ) -> Trails | None:
     """The star trails predicted from the body's rates; None where they are short."""
-    # In tracker axes an inertially fixed star moves opposite to the body.
-    turn = -np.radians(rates_deg_per_s) @ tracker.body_from_tracker * exposure_s
-    f = camera.focal_length_px
-    motion = Motion(
-        camera.center_u_px, camera.center_v_px, f * turn[1], -f * turn[0], float(turn[2]), f
-    )
+    motion = _motion_by_rates(tracker, camera, rates_deg_per_s, exposure_s)
     u, v = np.array([camera.center_u_px]), np.array([camera.center_v_px])
     length = float(np.hypot(*motion.trails(u, v)[:2])[0])
-    corner = 0.5 * math.hypot(*camera.shape) * abs(float(turn[2]))
+    corner = 0.5 * math.hypot(*camera.shape) * abs(motion.turn_rad)
     sigma = math.hypot(camera.psf_sigma_px, math.sqrt(PIXEL_VARIANCE))
     longest = max(length, corner)
     return Trails(motion, sigma, longest) if longest > LEAST_WIDTHS * sigma else None
+
+
+def _motion_by_rates(
+    tracker: Tracker, camera: Camera, rates_deg_per_s: Vector, exposure_s: float
+) -> Motion:
+    # In tracker axes an inertially fixed star moves opposite to the body.
+    turn = -np.radians(rates_deg_per_s) @ tracker.body_from_tracker * exposure_s
+    f = camera.focal_length_px
+    return Motion(
+        camera.center_u_px, camera.center_v_px, f * turn[1], -f * turn[0], float(turn[2]), f
+    )
 
 
 def usable_pixels(frame: Frame, camera: Camera) -> CountArray:
@@ -175,13 +181,20 @@ def remarks_on_trails(
         "of their trails were taken, where they were at mid exposure"
     )
     remarks = [middles]
-    expected = _by_rates(tracker, camera, rates_deg_per_s, exposure_s)
+    expected = _motion_by_rates(tracker, camera, rates_deg_per_s, exposure_s)
     u, v = np.array([camera.center_u_px]), np.array([camera.center_v_px])
-    seen_px = float(np.hypot(*trails.motion.trails(u, v)[:2])[0])
-    told_px = 0.0 if expected is None else float(np.hypot(*expected.motion.trails(u, v)[:2])[0])
-    if abs(seen_px - told_px) > CONTRADICTED_SHARE * max(seen_px, told_px) + trails.sigma_px:
-        remarks.append(
-            f"body_rates_deg_per_s: they move a star in the middle by {told_px:.1f} px, the frame "
-            f"shows {seen_px:.1f} px"
-        )
+    seen, told = (np.concatenate(motion.trails(u, v)[:2]) for motion in (trails.motion, expected))
+    seen_px, told_px = float(np.hypot(*seen)), float(np.hypot(*told))
+    # A trail does not tell which of its ends came first.
+    apart_px = min(float(np.hypot(*(seen - told))), float(np.hypot(*(seen + told))))
+    if apart_px > CONTRADICTED_SHARE * max(seen_px, told_px) + trails.sigma_px:
+        if not rates_deg_per_s.any():
+            contradiction = f"are zero or not given, and the frame shows {seen_px:.1f} px"
+        elif abs(seen_px - told_px) < 0.5 * apart_px:
+            contradiction = "move a star in the middle in another direction than the frame shows"
+        else:
+            contradiction = (
+                f"move a star in the middle by {told_px:.1f} px, the frame shows {seen_px:.1f} px"
+            )
+        remarks.append(f"body_rates_deg_per_s: they {contradiction}")
     return remarks
