@@ -53,18 +53,28 @@ def turn_of(
     best.
     """
     predicted = reference @ matrix_from_quaternion(quaternion).T
-    residual = np.cross(observed - predicted, predicted) / sigma_rad[:, None] ** 2
-    across = np.eye(3) - predicted[:, :, None] * predicted[:, None, :]
-    across /= sigma_rad[:, None, None] ** 2
-    alone, both = across.sum(axis=0), np.tensordot(share, across, 1)
+    residual, weight = observed - predicted, 1.0 / sigma_rad**2
+    shared = weight * share
+    alone, both = _information(predicted, weight), _information(predicted, shared)
     of_attitude = np.linalg.solve(alone, both)
-    information = np.tensordot(share**2, across, 1) - both @ of_attitude
-    pull = share @ residual - of_attitude.T @ residual.sum(axis=0)
+    information = _information(predicted, shared * share) - both @ of_attitude
+    pull = _pull(residual, predicted, shared) - of_attitude.T @ _pull(residual, predicted, weight)
     values, axes = np.linalg.eigh(information)
     known = values > LEAST_EIGENVALUE * float(np.trace(alone)) * max(float(share @ share), 1e-30)
     along = (axes.T @ pull)[known] / values[known]
     rad = axes[:, known] @ along
     return Turn(rad, float(pull @ rad), information, of_attitude)
+
+
+def _information(directions: Vector, weight: Vector) -> Matrix:
+    """Information (3, 3) about a common rotation of directions (N, 3) of given weights (N,)."""
+    return np.asarray(weight.sum() * np.eye(3) - (directions.T * weight) @ directions)
+
+
+def _pull(residual: Vector, directions: Vector, weight: Vector) -> Vector:
+    """Weighted sum (3,) of the cross products of residuals and directions, (N, 3) each."""
+    products = (residual.T * weight) @ directions
+    return (products - products.T)[[1, 2, 0], [2, 0, 1]]
 
 
 def doubts_of(
@@ -99,10 +109,12 @@ def doubts_of(
         tracker_of = np.repeat(
             np.arange(len(corrected)), [len(each.sigma_rad) for each in corrected]
         )
-        for index in np.unique(tracker_of[used]).tolist() if len(corrected) > 1 else ():
+        turned = np.unique(tracker_of[used]).tolist()
+        if len(turned) < 3:
+            # The second of two trackers is turned against the first by the opposite.
+            turned = turned[:-1]
+        for index in turned:
             share = (tracker_of[used] == index).astype(float)
-            if share.all():
-                break
             turn = turn_of(*matched, solution.quest, share)
             if turn.contradicts(solution):
                 is_contradicted = True
@@ -112,18 +124,16 @@ def doubts_of(
                     f"arcsec against the other stars (chi-square {turn.chi_square:.0f}): by its "
                     "alignment, its clock, or a motion that body_rates_deg_per_s do not hold"
                 )
-                if len(np.unique(tracker_of[used])) == 2:
-                    break
     return warnings, is_contradicted
 
 
 def _rates_contradicted(search: Search, turn: Turn, offset_s: Vector) -> str:
     rates = search.batch.body_rates_deg_per_s + np.degrees(turn.rad)
     x, y, z = rates.tolist()
-    told = "body_rates_deg_per_s" if search.batch.body_rates_deg_per_s.any() else "a body at rest"
+    assumed = "body_rates_deg_per_s" if search.batch.body_rates_deg_per_s.any() else "a body at rest"
     return (
         f"rates_contradicted: stars seen {offset_s.min():+.3g} to {offset_s.max():+.3g} s after "
-        f"the batch's time fit rates of ({x:.3g}, {y:.3g}, {z:.3g}) deg/s, not {told} "
+        f"the batch's time fit rates of ({x:.3g}, {y:.3g}, {z:.3g}) deg/s, not {assumed} "
         f"(chi-square {turn.chi_square:.0f})"
     )
 
