@@ -130,7 +130,9 @@ def doubts_of(
 def _rates_contradicted(search: Search, turn: Turn, offset_s: Vector) -> str:
     rates = search.batch.body_rates_deg_per_s + np.degrees(turn.rad)
     x, y, z = rates.tolist()
-    assumed = "body_rates_deg_per_s" if search.batch.body_rates_deg_per_s.any() else "a body at rest"
+    assumed = (
+        "body_rates_deg_per_s" if search.batch.body_rates_deg_per_s.any() else "a body at rest"
+    )
     return (
         f"rates_contradicted: stars seen {offset_s.min():+.3g} to {offset_s.max():+.3g} s after "
         f"the batch's time fit rates of ({x:.3g}, {y:.3g}, {z:.3g}) deg/s, not {assumed} "

@@ -196,8 +196,10 @@ def _require_own_rates(file: str, segment: Segment) -> None:
     if rate is None or segment.discrete:
         return
     step_s = np.diff(segment.time_ns)[:, None] * 1e-9
-    turned, told = rotation_vectors(q[:-1], q[1:]), 0.5 * (rate[1:] + rate[:-1]) * step_s
-    by_steps, by_rates, missed = (np.linalg.norm(v, axis=1) for v in (turned, told, turned - told))
+    turned, expected = rotation_vectors(q[:-1], q[1:]), 0.5 * (rate[1:] + rate[:-1]) * step_s
+    by_steps, by_rates, missed = (
+        np.linalg.norm(v, axis=1) for v in (turned, expected, turned - expected)
+    )
     larger = np.maximum(by_steps, by_rates)
     near = larger <= QUARTER_TURN_RAD
     stands = near & (q[1:] == q[:-1]).all(axis=1) & (by_rates > MISSED_RAD)
@@ -210,7 +212,7 @@ def _require_own_rates(file: str, segment: Segment) -> None:
     if steps < FEWEST_STEPS or 2 * count <= steps:
         return
     for factor, words in ((-1.0, "of the opposite sign"), (math.degrees(1.0), "in rad/s")):
-        other = np.linalg.norm(turned - factor * told, axis=1)
+        other = np.linalg.norm(turned - factor * expected, axis=1)
         if np.median(other[wrong]) < MEANT_SHARE * np.median(missed[wrong]):
             message = (
                 f"do not lead from one attitude to the next in {count} of {steps} steps, and do "
