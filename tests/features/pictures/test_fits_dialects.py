@@ -177,6 +177,12 @@ TIMES = {
         {},
         0.0,
     ),
+    "UTC and a local sidereal time": (
+        {"DATE-AVG": NOON, "COMMENT": "times are in UTC; local sidereal time is in LST"},
+        {},
+        0.0,
+    ),
+    "not local": ({"DATE-AVG": NOON, "HISTORY": "DATE-AVG is UTC, not local time"}, {}, 0.0),
     "TAI by the comment": ({"DATE-AVG": ("2026-03-01T12:00:37", "TAI")}, {}, 0.0),
     "UTC of a receiver of GPS": ({"DATE-AVG": (NOON, "UTC from GPS")}, {}, 0.0),
     "MJD in TT": ({"MJD-AVG": 61100.5 + 69.184 / 86400, "TIMESYS": "TT"}, {}, 0.0),

@@ -87,7 +87,8 @@ _LOCAL = re.compile(
     r"[ECMP][SD]T|HST|AKST|NZST)\b|\b(Beijing|Moscow|Tokyo) time\b"
 )
 _NOTED_LOCAL = re.compile(
-    r"(?i)\b(times|dates?|clock|timestamps?|date-\w+|time-obs)\b.*\b(is|are|in)\b.*\blocal\b"
+    r"(?i)\b(times|dates?|clock|timestamps?|date-\w+|time-obs)\b.*\b(is|are|in)\b.*"
+    r"(?<!not )\blocal\b(?! (mean |apparent )?(sidereal|oscillator))"
 )
 _NOTED_UNIT = re.compile(
     r"(?i)\b(exptime|exposure|xposure|exposure times?)\b"
