@@ -244,10 +244,11 @@ def _worst(
     context: PageContext, name: str, query: SpacecraftQuery, stretch: ShownPeriod | None
 ) -> Ranking:
     """Worst batches by a quantity: by default the first one whose worst value is not zero."""
-    ranking = Ranking(by=query.by or FIRST_LOOKED_AT[0], items=[])
-    for by in (query.by,) if query.by else FIRST_LOOKED_AT:
-        if stretch is None or (ranking.items and ranking.items[0].value):
-            break
+    asked = (query.by,) if query.by else FIRST_LOOKED_AT
+    if stretch is None:
+        return Ranking(by=asked[0], items=[])
+    found = []
+    for by in asked:
         ranking = context.app.spacecraft.ranking(
             name,
             by=by,
@@ -257,7 +258,10 @@ def _worst(
             limit=WORST,
             tracker=query.tracker,
         )
-    return ranking
+        if ranking.items and ranking.items[0].value:
+            return ranking
+        found.append(ranking)
+    return found[0]
 
 
 def _others(context: PageContext, query: SpacecraftQuery, stretch: ShownPeriod | None) -> list[str]:
