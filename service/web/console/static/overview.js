@@ -13,9 +13,10 @@ function show() {
 
 let typing = null;
 document.addEventListener("input", ({ target }) => {
-  if (target.form?.id !== "filter") return;
+  const { form } = target;
+  if (form?.id !== "filter") return;
   clearTimeout(typing);
-  typing = setTimeout(() => target.form.requestSubmit(), target.matches("select") ? 0 : TYPING_MS);
+  typing = setTimeout(() => form.requestSubmit(), target.matches("select") ? 0 : TYPING_MS);
 });
 document.addEventListener("drawn", show);
 document.addEventListener("theme", show);
