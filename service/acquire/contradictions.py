@@ -56,7 +56,8 @@ def turn_of(
     residual, weight = observed - predicted, 1.0 / sigma_rad**2
     shared = weight * share
     alone, both = _information(predicted, weight), _information(predicted, shared)
-    of_attitude = np.asarray(np.linalg.solve(alone, both), dtype=np.float64)
+    # Of a batch with a rival attitude one star or none may be matched, which leaves axes unknown.
+    of_attitude = np.linalg.pinv(alone, LEAST_EIGENVALUE, hermitian=True) @ both
     information = _information(predicted, shared * share) - both @ of_attitude
     pull = _pull(residual, predicted, shared) - of_attitude.T @ _pull(residual, predicted, weight)
     values, axes = np.linalg.eigh(information)

@@ -168,3 +168,15 @@ def test_the_turn_of_noise_is_distributed_as_chi_square_says(kind, rng):
         share = np.repeat([0.0, 1.0], 5) if kind == "tracker" else rng.uniform(-1.0, 1.0, 10)
         squares[k] = turn_of(body, stars, sigma, solved(body, stars, 2.0).quest, share).chi_square
     assert_chi_square(squares, 3)
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_fewer_matched_stars_than_an_attitude_needs_contradict_nothing(count, rng):
+    """As of a batch with a rival attitude, whose stars are ambiguous."""
+    truth = random_attitude(rng)
+    stars = field_of_stars(rng, rng.normal(size=3), 4.0, 6)
+    body = seen(rng, truth, stars, 2.0)
+    sigma, share = np.full(count, math.radians(2.0 / 3600.0)), np.full(count, 0.1)
+    turn = turn_of(body[:count], stars[:count], sigma, solved(body, stars, 2.0).quest, share)
+    assert turn.chi_square == pytest.approx(0.0, abs=1e-6)
+    assert np.isfinite(turn.rad).all()

@@ -174,7 +174,7 @@ def test_while_one_caller_warms_up_another_is_told_to_wait(app, monkeypatch):
 def test_it_is_ready_for_zones_while_other_kernels_are_compiled(make, monkeypatch, tmp_path):
     begun, go_on = threading.Event(), threading.Event()
 
-    def run(build, missions, zones_built, whole_sky_built):
+    def run(build, missions, zones_built, whole_sky_built, build_files):
         build.zones_needed = False
         zones_built()
         begun.set()
@@ -192,7 +192,10 @@ def test_it_is_ready_for_zones_while_other_kernels_are_compiled(make, monkeypatc
         first = threads.submit(app.service.ready)
         assert begun.wait(30)
         app.service.ready()
-        assert [each.split()[0] for each in app.service.being_compiled()] == ["searches", "frames,"]
+        assert [each.split()[0] for each in app.service.being_compiled()] == [
+            "searches",
+            "what-ifs,",
+        ]
         answer = asyncio.run(app.submissions.answered(make("b1").text.encode()))
         assert json.loads(answer.body)["path"] == "zone"
         lost = json.loads(make("b2").text) | {"a_priori": None}
@@ -223,8 +226,9 @@ def test_no_batch_of_simulated_telemetry_or_of_the_last_epoch_waits_for_a_file_o
 ):
     """A server that starts without files of the sky builds these before it is ready."""
 
-    def run(build, missions, zones_built, whole_sky_built):
+    def run(build, missions, zones_built, whole_sky_built, build_files):
         zones_built()
+        build_files()
         whole_sky_built()
         build.is_needed = build.zones_needed = build.whole_sky_needed = False
 
