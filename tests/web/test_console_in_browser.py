@@ -15,7 +15,7 @@ from service.web.console.formatting import completed_utc
 from tests.fresh_databases import sqlite_at
 from tests.storage.bulk import put, result_row
 from tests.web.browser import CHROMIUM, Browser
-from tests.web.fitting import assert_fits, faults
+from tests.web.fitting import CHARTS_DRAWN, assert_fits, faults
 from tests.web.serving import Server, in_process_settings
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")
@@ -246,24 +246,103 @@ PICK = "document.getElementById('beside-{}')"
 KEYS = "[data-chart=stars] + .chart-keys"
 
 
+SAVED = """(() => {
+  HTMLAnchorElement.prototype.click = function () { window.saved = [this.download, this.href]; };
+  window.written = []; window.drawn = 0;
+  const pen = CanvasRenderingContext2D.prototype;
+  for (const name of ["fillText", "stroke", "fill", "drawImage"]) {
+    const draw = pen[name];
+    pen[name] = function (...what) {
+      if (name === "fillText") window.written.push(what[0]);
+      else window.drawn += 1;
+      return draw.apply(this, what);
+    };
+  }
+})()"""
+
+
 def test_the_first_chart_is_saved_as_a_picture_with_its_key(browser, address, full_run):
     browser.open(f"{address}/spacecraft/XTE?run={full_run}&beside=SOHO")
     browser.wait(lambda: browser.run(DRAWN))
     shows(browser, "SOHO: ambiguous stars", KEYS)
-    browser.run(
-        "HTMLAnchorElement.prototype.click = function () {"
-        " window.saved = [this.download, this.href]; };"
-        "const lines = CanvasRenderingContext2D.prototype.fillText; window.written = [];"
-        "CanvasRenderingContext2D.prototype.fillText = function (text, ...place) {"
-        " window.written.push(text); return lines.call(this, text, ...place); };"
-    )
+    browser.run(SAVED)
     browser.run("document.querySelector('[data-picture]').click()")
     name, file = browser.run("window.saved")
-    assert name == "XTE-stars.png"
+    assert name == f"XTE-Ambiguous-and-unmatched-stars-{full_run}.png"
     assert file.startswith("data:image/png;base64,")
     written = " ".join(browser.run("window.written"))
-    assert "XTE: Ambiguous and unmatched stars, " in written
-    assert "SOHO: ambiguous stars" in written
+    assert f"XTE: Ambiguous and unmatched stars Run {full_run}, 1999-" in written
+    assert "━ XTE: ambiguous stars ╌ XTE: unmatched stars ━ SOHO: ambiguous stars" in written
+    # The mark of each line has the colour of the line.
+    tones = browser.run(
+        f"[...document.querySelectorAll('{KEYS} > * > span')].map(e => getComputedStyle(e).color)"
+    )
+    assert len(set(tones)) == 3
+    assert browser.complaints == []
+
+
+CHARTS = """[...document.querySelectorAll("main svg[role=img], main [data-chart]")]
+    .filter(each => each.checkVisibility() && !each.closest("table"))"""
+
+
+def test_every_chart_of_every_page_is_saved_in_the_same_way(browser, address, client, full_run):
+    """The shapes of a chart are drawn, and its title, run, period and key are written."""
+    query = {"run": full_run, "spacecraft": "XTE"}
+    batch = client.get("/api/v1/batches", params=query).json()["items"][0]["id"]
+    pages = [f"/batches/{batch}", "/spacecraft/XTE/period", "/spacecraft/XTE"]
+    for page in pages:
+        browser.open(f"{address}{page}?run={full_run}")
+        browser.wait(lambda: browser.run(CHARTS_DRAWN))
+        without = (
+            f"{CHARTS}.filter(e => !e.closest('figure, section').querySelector('[data-picture]')"
+        )
+        assert (
+            browser.run(f"{without} && !e.closest('section').querySelector('[data-picture]'))")
+            == []
+        )
+        browser.run(SAVED)
+        buttons = (
+            "[...document.querySelectorAll('[data-picture]')].filter(e => e.checkVisibility())"
+        )
+        for k in range(browser.run(f"{buttons}.length")):
+            browser.run(f"window.written = []; window.drawn = 0; {buttons}[{k}].click()")
+            name, file = browser.run("window.saved")
+            assert name.startswith("XTE-")
+            assert name.endswith(f"-{full_run}.png")
+            assert file.startswith("data:image/png;base64,")
+            title, period, *words = browser.run("window.written")
+            assert title.startswith("XTE")
+            assert period.startswith(f"Run {full_run}, 1999-0")
+            shapes = browser.run(
+                f"{buttons}[{k}].closest('figure, section').querySelectorAll('svg path, svg circle')"
+                ".length"
+            )
+            assert browser.run("window.drawn") >= max(shapes, 1), (page, name)
+            assert words or shapes == 0
+    assert browser.complaints == []
+
+
+def test_the_read_out_of_a_trend_has_the_value_of_every_line(browser, address, client, drawn, run):
+    """Those of another spacecraft and of the day before, whose batches have times of their own."""
+    for name, day, second in (("XTE", "03-01", 0), ("SOHO", "03-01", 15), ("XTE", "02-28", 8)):
+        for k, batch in enumerate(drawn(name, 20, seed=4)):
+            time_of_day = f"00:{k // 2:02}:{second + 30 * (k % 2):02}"
+            body = batch | {"batch": f"{name}-{day}-{k}", "time": f"1999-{day}T{time_of_day}Z"}
+            client.post("/api/v1/batches", json=body | {"run": run}).raise_for_status()
+    period = "start=1999-060T00:00:00Z&end=1999-060T00:10:00Z"
+    browser.open(f"{address}/spacecraft/XTE?run={run}&beside=SOHO&before=day&{period}")
+    browser.wait(lambda: browser.run(DRAWN))
+    left, y, width = browser.run(
+        "(b => [b.left, b.top + b.height / 2, b.width])"
+        "(document.querySelector('[data-chart=stars] .u-over').getBoundingClientRect())"
+    )
+    for part in (0.2, 0.3, 0.4):
+        place = {"x": left + part * width, "y": y}
+        browser.call("Input.dispatchMouseEvent", type="mouseMoved", **place)
+        read = text(browser, "[data-readout=stars]")
+        for line in (r"UTC: XTE: ambiguous stars \d", r", SOHO: ambiguous stars \d"):
+            assert re.search(line, read), read
+        assert re.search(r", XTE: ambiguous stars, 1 d before \d", read), read
     assert browser.complaints == []
 
 

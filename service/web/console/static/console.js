@@ -1,6 +1,7 @@
 // Parts of every page: the theme, the choice of a run, copying, and the event stream.
 import { keepFresh, refreshSoon } from "./live_updates.js";
 import { attempt, send } from "./actions.js";
+import "./picture.js";
 import "./time_fields.js";
 import { rooted } from "./requests.js";
 

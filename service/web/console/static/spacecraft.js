@@ -115,31 +115,6 @@ function narrowList() {
   for (const each of document.querySelectorAll(".picks li")) each.hidden = !each.textContent.toLowerCase().includes(typed);
 }
 
-// The first chart as a file, with its title, its period and the key of its lines below.
-function savePicture() {
-  const [{ chart, holder, definition: { title } }] = trends;
-  if (!chart) return;
-  const { canvas } = chart.ctx;
-  const px = devicePixelRatio;
-  const { color, backgroundColor } = getComputedStyle(document.body);
-  const { start, end } = stretch().dataset;
-  const { spacecraft } = document.getElementById("charts").dataset;
-  const heading = `${spacecraft}: ${title}, ${utc(posix(start))} to ${utc(posix(end))} UTC`;
-  const keys = [...holder.nextElementSibling.querySelectorAll(":scope > :not([aria-pressed=false])")].map((each) => [each.textContent, getComputedStyle(each.firstElementChild ?? each).color]);
-  const lines = [[heading, color], ...keys];
-  const sheet = element("canvas", { width: canvas.width, height: canvas.height + (10 + 20 * lines.length) * px });
-  const pen = sheet.getContext("2d");
-  pen.fillStyle = backgroundColor;
-  pen.fillRect(0, 0, sheet.width, sheet.height);
-  pen.drawImage(canvas, 0, 0);
-  pen.font = `${13 * px}px system-ui, sans-serif`;
-  for (const [row, [text, tone]] of lines.entries()) {
-    pen.fillStyle = tone;
-    pen.fillText(text, 8 * px, canvas.height + (16 + 20 * row) * px);
-  }
-  element("a", { href: sheet.toDataURL(), download: `${spacecraft}-${holder.dataset.chart}.png` }).click();
-}
-
 if (stretch()) {
   make();
   draw();
@@ -159,7 +134,6 @@ if (stretch()) {
   document.addEventListener("input", narrowList);
   document.addEventListener("drawn", narrowList);
   document.addEventListener("drawn", draw);
-  document.querySelector("[data-picture]")?.addEventListener("click", savePicture);
   document.addEventListener("theme", () => shown && draw());
 } else {
   // The first batch needs the full page, with charts.

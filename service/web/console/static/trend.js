@@ -20,6 +20,13 @@ function colour(name) {
   return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 }
 
+const toneOf = ({ shift }, k) => (shift ? "--soft" : TONES[k % TONES.length]);
+
+// The mark of a line before its name, in the line's colour.
+function mark(tone, dash) {
+  return element("span", { className: tone.slice(2), ariaHidden: "true" }, dash ? "╌ " : "━ ");
+}
+
 // Ticks: the time of day, where a day begins its date below; the day of the year below the date.
 function tickLabels(_, splits, __, ___, step) {
   let before = "";
@@ -293,7 +300,7 @@ export class Trend {
     known.forEach(({ name }, k) => {
       for (let part = 1; part <= 3; part++) series[3 * k + part].show = !this.hidden.has(name);
     });
-    this.others.forEach(({ shift }, k) => series.push({ stroke: colour(shift ? "--soft" : TONES[k % TONES.length]), width: 1.3, spanGaps: true, points: { show: false } }));
+    this.others.forEach((each, k) => series.push({ stroke: colour(toneOf(each, k)), width: 1.3, spanGaps: true, points: { show: false } }));
     const scale = this.definition.percent ? 100 : 1;
     const names = known.map(({ name }) => name);
     const lines = merged(limitLines(this.limits, names), names).map((line) => ({ ...line, value: line.value * scale, text: `${line.text} ${this.text(line.value * scale)}` }));
@@ -369,12 +376,32 @@ export class Trend {
       return;
     }
     const parts = this.known.map(({ label }, k) => {
-      const [mean, min, max] = [1, 2, 3].map((each) => this.data[3 * k + each][index]);
-      if (mean === null || mean === undefined) return `${label} –`;
-      const spread = min === max ? "" : ` (${this.text(min)} to ${this.text(max)})`;
-      return `${label} ${this.text(mean)}${spread}`;
+      const at = this.nearest(3 * k + 1, index, this.history);
+      const [mean, min, max] = [1, 2, 3].map((each) => this.data[3 * k + each][at]);
+      const spread = at === undefined || min === max ? "" : ` (${this.text(min)} to ${this.text(max)})`;
+      return `${this.own}${label} ${this.text(mean)}${spread}`;
     });
-    this.readout.textContent = `${utc(this.data[0][index])} UTC: ${parts.join(", ")}`;
+    const beside = this.others.map((other, k) => {
+      const column = 3 * this.known.length + 1 + k;
+      return `${this.nameOf(other)} ${this.text(this.data[column][this.nearest(column, index, other)])}`;
+    });
+    this.readout.textContent = `${utc(this.data[0][index])} UTC: ${[...parts, ...beside].join(", ")}`;
+  }
+
+  // Spacecraft have times of their own: the place of a column's value nearest in time, within the usual step of its history.
+  nearest(column, index, history) {
+    const [times, values] = [this.data[0], this.data[column]];
+    const [step, away] = [usualStep(history), (place) => Math.abs(times[place] - times[index])];
+    const known = [...times.keys()].filter((place) => values[place] !== null && values[place] !== undefined && away(place) <= step);
+    return known.sort((a, b) => away(a) - away(b))[0];
+  }
+
+  get own() {
+    return this.others.length ? `${this.history.spacecraft}: ` : "";
+  }
+
+  nameOf({ spacecraft, shift }) {
+    return `${spacecraft}: ${this.known[0].label}${shift ? `, ${shift / DAY_S} d before` : ""}`;
   }
 
   // The chart in words, for readers who cannot see it; and the key of its lines.
@@ -404,12 +431,8 @@ export class Trend {
   drawKeys() {
     const keys = this.holder.nextElementSibling?.matches(".chart-keys") ? this.holder.nextElementSibling : document.createElement("p");
     keys.className = "chart-keys range";
-    const own = this.others.length ? `${this.history.spacecraft}: ` : "";
-    const buttons = own || this.known.length > 1 ? this.known.map(({ name, label, dash }) => this.key(name, `${dash ? "╌" : "━"} ${own}${label}`)) : [];
-    const names = this.others.map(({ spacecraft, shift, unix_s: moments }, k) => {
-      const mark = element("span", { className: shift ? "soft" : TONES[k % TONES.length].slice(2), ariaHidden: "true" }, "━ ");
-      return element("span", {}, mark, `${spacecraft}: ${this.known[0].label}${shift ? `, ${shift / DAY_S} d before` : ""}${moments.length ? "" : ", no batches then"}`);
-    });
+    const buttons = this.own || this.known.length > 1 ? this.known.map((each) => this.key(each)) : [];
+    const names = this.others.map((each, k) => element("span", {}, mark(toneOf(each, k)), `${this.nameOf(each)}${each.unix_s.length ? "" : ", no batches then"}`));
     keys.replaceChildren(...buttons, ...names);
     keys.hidden = !keys.childElementCount;
     this.holder.after(keys);
@@ -418,8 +441,8 @@ export class Trend {
     this.pressed = null;
   }
 
-  key(name, label) {
-    const button = element("button", { type: "button", ariaPressed: String(!this.hidden.has(name)) }, label);
+  key({ name, label, tone, dash }) {
+    const button = element("button", { type: "button", ariaPressed: String(!this.hidden.has(name)) }, mark(tone, dash), `${this.own}${label}`);
     button.addEventListener("click", () => {
       this.hidden.has(name) ? this.hidden.delete(name) : this.hidden.add(name);
       this.show(this.history, ...this.bounds, this.annotations, this.others);
