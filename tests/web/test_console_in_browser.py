@@ -16,7 +16,7 @@ from tests.fresh_databases import sqlite_at
 from tests.storage.bulk import put, result_row
 from tests.web.browser import CHROMIUM, Browser
 from tests.web.fitting import CHARTS_DRAWN, assert_fits, faults
-from tests.web.serving import Server, in_process_settings
+from tests.web.serving import Server, ended, in_process_settings
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")
 
@@ -313,10 +313,8 @@ def test_every_chart_of_every_page_is_saved_in_the_same_way(browser, address, cl
             title, period, *words = browser.run("window.written")
             assert title.startswith("XTE")
             assert period.startswith(f"Run {full_run}, 1999-0")
-            shapes = browser.run(
-                f"{buttons}[{k}].closest('figure, section').querySelectorAll('svg path, svg circle')"
-                ".length"
-            )
+            whole = f"{buttons}[{k}].closest('figure, section')"
+            shapes = browser.run(f"{whole}.querySelectorAll('svg path, svg circle').length")
             assert browser.run("window.drawn") >= max(shapes, 1), (page, name)
             assert words or shapes == 0
     assert browser.complaints == []
@@ -761,6 +759,68 @@ def test_a_replay_is_cancelled_and_continued_where_its_row_is(browser, address, 
     browser.wait(lambda: browser.run(f"{rows}.some(row => row.innerText.includes('continued '))"))
     assert not browser.run(f"!!{again}")
     assert browser.complaints == []
+
+
+def test_replays_of_every_run_are_followed_where_they_are_listed(browser, address, client, batch):
+    """Their lines are counted on, and their ends told, while the page shows the live batches."""
+    lines = "".join(json.dumps(batch | {"batch": f"followed-{k}"}) + "\n" for k in range(3_000))
+    browser.open(f"{address}/runs")
+    browser.wait(lambda: browser.run(CONNECTED))
+    runs = [f"followed-{next(_numbers)}" for _ in range(2)]
+    for run in runs:
+        client.post(
+            "/api/v1/replays",
+            params={"run": run, "name": run},
+            content=lines,
+            headers={"Content-Type": "application/x-ndjson"},
+        ).raise_for_status()
+    row = (
+        "[...document.querySelectorAll('#runs tr:has([data-name=lines])')]"
+        ".find(each => each.innerText.includes('{}'))"
+    )
+    counted = {run: set() for run in runs}
+
+    def is_over():
+        for run in runs:
+            shown = browser.run(f"{row.format(run)}?.querySelector('[data-name=lines]').innerText")
+            counted[run].add(shown)
+        return all(browser.run(f"!!{row.format(run)}?.innerText.includes('done')") for run in runs)
+
+    browser.wait(is_over, 60)
+    assert all(len(counted[run]) > 2 for run in runs), counted
+    assert browser.run("location.search") == ""
+    assert browser.complaints == []
+
+
+def test_the_reason_why_a_replay_cannot_be_cancelled_stays_in_sight(
+    browser, address, client, batch
+):
+    """The row is of before its end; the reason is in the window, and the row then says the end."""
+    run = f"over-{next(_numbers)}"
+    lines = "".join(json.dumps(batch | {"batch": f"{run}-{k}"}) + "\n" for k in range(2_000))
+    answer = client.post(
+        "/api/v1/replays",
+        params={"run": run, "name": run},
+        content=lines,
+        headers={"Content-Type": "application/x-ndjson"},
+    )
+    browser.open(f"{address}/runs", height=400)
+    button = f"document.querySelector('[data-send=\"DELETE {answer.headers['Location']}\"]')"
+    browser.wait(lambda: browser.run(f"!!{button}"))
+    # A region with selected text is not drawn anew.
+    browser.run(f"getSelection().selectAllChildren({button}.closest('tr').querySelector('th'))")
+    ended(client, answer)
+    browser.run(f"{button}.click()")
+    browser.wait(lambda: "Not done: " in text(browser, "#message"))
+    browser.run("getSelection().removeAllRanges()")
+    browser.wait(lambda: browser.run(f"!{button}"))
+    time.sleep(1.5)
+    assert "Not done: " in text(browser, "#message")
+    top, bottom = browser.run(
+        "(b => [b.top, b.bottom])(document.getElementById('message').getBoundingClientRect())"
+    )
+    assert 0 <= top < bottom < 401
+    browser.complaints.clear()
 
 
 def test_a_shift_from_the_overview_to_the_star_and_the_alarm(browser, address, client, watched):

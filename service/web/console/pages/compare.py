@@ -162,6 +162,11 @@ def runs_page(query: FromQuery[PageQuery], context: ContextDep) -> Response:
         panels=context.panels("runs_page"),
         replays=replays,
         later=_later(replays),
+        kinds={
+            suffix: each.media_types[0]
+            for each in context.app.replays.formats.values()
+            for suffix in each.suffixes
+        },
         bound=bound,
     )
 

@@ -16,6 +16,7 @@ export async function attempt(button, status, work) {
   } catch (error) {
     status.className = "problem";
     status.textContent = `Not done: ${error.message}`;
+    status.scrollIntoView({ block: "nearest" });
   } finally {
     if (button) button.disabled = false;
   }

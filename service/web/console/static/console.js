@@ -126,8 +126,11 @@ document.addEventListener("click", ({ target }) => {
   if (!button) return;
   const { send: asked, body, done } = button.dataset;
   attempt(button, document.getElementById("message"), async () => {
-    await send(...asked.split(" "), body);
-    refreshSoon();
+    try {
+      await send(...asked.split(" "), body);
+    } finally {
+      refreshSoon();
+    }
     return done;
   });
 });

@@ -26,6 +26,8 @@ const POLL_MS = 10000;
 
 const shown = document.getElementById("connection");
 const run = document.body.dataset.run;
+// Such a page shows the replays of every run.
+const isOfEveryRun = document.querySelector("[data-every-run]") !== null;
 let source = null;
 let last = document.body.dataset.lastEvent || null;
 let drawing = null;
@@ -91,7 +93,7 @@ setInterval(() => {
 }, 1000);
 
 function streamAddress() {
-  const query = new URLSearchParams({ run });
+  const query = new URLSearchParams(isOfEveryRun ? {} : { run });
   if (document.body.dataset.stream) query.set("spacecraft", document.body.dataset.stream);
   if (last !== null) query.set("last_event_id", last);
   return rooted(`/api/v1/events?${query}`);
@@ -119,8 +121,8 @@ function connected(event) {
 export function received(event) {
   last = event.lastEventId || last;
   const data = JSON.parse(event.data);
-  if (!concernsRun(data)) return;
-  if (event.type === "alarm") noteCritical(data);
+  if (!isOfEveryRun && !concernsRun(data)) return;
+  if (event.type === "alarm" && concernsRun(data)) noteCritical(data);
   refreshSoon();
 }
 

@@ -2,7 +2,6 @@
 import { refreshSoon } from "./live_updates.js";
 import { attempt, send } from "./actions.js";
 
-const KINDS = { csv: "text/csv", tsv: "text/csv", tar: "application/x-tar" };
 const message = document.getElementById("message");
 
 const form = document.getElementById("replay");
@@ -25,8 +24,8 @@ form.addEventListener("submit", (event) => {
   attempt(event.submitter, message, async () => {
     const query = new URLSearchParams({ run: run.value.trim(), name: file.files[0].name.slice(-200) });
     if (alarms.checked) query.set("alarms", "true");
-    const ending = file.files[0].name.split(".").at(-1).toLowerCase();
-    const headers = { "Content-Type": KINDS[ending] ?? "application/x-ndjson" };
+    const ending = `.${file.files[0].name.split(".").at(-1).toLowerCase()}`;
+    const headers = { "Content-Type": JSON.parse(form.dataset.kinds)[ending] ?? "application/x-ndjson" };
     const replay = await send("POST", `/api/v1/replays?${query}`, file.files[0], headers);
     refreshSoon();
     return `Replaying ${file.files[0].name} into run ${replay.run}.`;
