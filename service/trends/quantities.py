@@ -153,8 +153,9 @@ QUANTITIES: dict[str, Quantity] = {
             by_tracker=True,
             cause=Cause(
                 "Fewer or fainter stars than usual, or a crowded or sparse region of the sky.",
-                "Open the worst batch. If its residuals are as predicted, wait until the region "
-                "has passed, or try the separation tolerance that the advice names.",
+                "Open the worst batch. If it has an attitude, with residuals as predicted, wait "
+                "until the region has passed, or try the separation tolerance that the advice "
+                "names.",
             ),
         ),
         Quantity(

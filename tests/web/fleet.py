@@ -155,9 +155,9 @@ def put_alarm(
 ) -> None:
     """An alarm of a spacecraft with what its value did, by hours after the day's start."""
     begin = shifted(END, -DAY_S)
-    alarm = _alarm(name, 0, "live") | columns
     places = [(action, shifted(begin, 3600.0 * hours)) for action, hours in actions]
-    alarm |= _place("raised", places[0][1]) | _place("latest", places[-1][1])
+    alarm = _alarm(name, 0, "live")
+    alarm |= _place("raised", places[0][1]) | _place("latest", places[-1][1]) | columns
     if in_limits:
         alarm |= {"current_severity": None, "returned_at": utc_now().text}
     rows = [

@@ -100,6 +100,17 @@ def test_of_several_alarms_the_one_that_is_worst_now_stands_for_all(small_fleet)
     assert shown == [("critical", "03"), ("critical", "02"), ("warning", "01")]
 
 
+def test_of_equal_alarms_the_one_far_beyond_its_limit_stands_before_a_newer_one(small_fleet):
+    """A tracker whose stars go wrong comes before a healthy one that they draw along."""
+    app, _ = small_fleet
+    for hour, tracker, value in ((2.0, "STARTRACKER_1", 8.0), (3.0, "STARTRACKER_2", 1.2)):
+        worst = {f"{which}_value": value for which in ("latest", "worst")}
+        fleet.put_alarm(app, "SAT-002", [("raised", hour)], tracker=tracker, bound=1.0, **worst)
+    found = app.spacecraft.overview(spacecraft=["SAT-002"]).items
+    (item,) = [each for each in found if each.name == "SAT-002"]
+    assert [each.tracker for each in item.alarms][:2] == ["STARTRACKER_1", "STARTRACKER_2"]
+
+
 # ---- finding a batch by its time -----------------------------------------------------------------
 
 

@@ -168,7 +168,7 @@ def _effect(present: VariantOutcome | None, with_it: VariantOutcome | None) -> s
         f"With {value:g} the votes would have left {with_it.not_unique_percent:.2f} % of "
         f"{with_it.observed} stars ambiguous or unmatched instead of "
         f"{present.not_unique_percent:.2f} % (a change of {change.low:+.2f} to "
-        f"{change.high:+.2f} points)."
+        f"{change.high:+.2f} percentage points)."
     )
 
 
@@ -369,7 +369,7 @@ def _size_statement(size: ZoneSize, costs: Sequence[ZoneCost]) -> Statement:
     start = size.setting
     room = (
         f"{size.size_deg:g}° leaves room for an a priori error of {size.margin_deg:.2f}° about the "
-        f"field of view of {size.field_of_view_deg:g}°"
+        f"field of view, whose radius is {size.view_radius_deg:g}°"
     )
     errors = size.errors
     if errors is None or size.covering_deg is None:
@@ -419,7 +419,7 @@ def _cost(size: ZoneSize, costs: Sequence[ZoneCost]) -> str:
 
 def _pair_separation_statement(mission: Mission, size: ZoneSize) -> Statement:
     limit_deg = mission.tolerances.pair_separation_max_deg
-    wide_deg = 2.0 * size.field_of_view_deg
+    wide_deg = 2.0 * size.view_radius_deg
     start = "pair_separation_max_deg"
     line = f"{f'pair_separation_max_deg = {wide_deg:g}':<32} # was {limit_deg:g}"
     lines = (FileChange("tolerances", None, line),)

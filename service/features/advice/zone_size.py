@@ -78,7 +78,7 @@ class ZoneSize:
 
     setting: str
     size_deg: float
-    field_of_view_deg: float
+    view_radius_deg: float
     margin_deg: float
     errors: AprioriErrors | None
     verdict: Verdict
@@ -118,7 +118,7 @@ def zone_size(
     return ZoneSize(
         setting=setting,
         size_deg=now_deg,
-        field_of_view_deg=view_deg,
+        view_radius_deg=view_deg,
         margin_deg=margin_deg,
         errors=errors,
         verdict=verdict,

@@ -195,10 +195,7 @@ def list_alarms(
 
 
 def active_alarms(connection: Connection, run: str, now: str) -> list[models.Alarm]:
-    """Alarms of a run that are not cleared, sorted by `present_rank`, then newest first.
-
-    Of equals the newest is first.
-    """
+    """Alarms of a run that are not cleared, sorted by `present_rank`, then newest first."""
     query = select(alarms).where(alarms.c.run == run, _ACTIVE).order_by(alarms.c.id.desc())
     found = [shown_alarm(row, now) for row in connection.execute(query).mappings()]
     return sorted(found, key=present_rank, reverse=True)

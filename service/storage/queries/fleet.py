@@ -119,10 +119,26 @@ def fleet_rows(
     return as_of, tuple(_row(each, facts, run, now, active) for each in found)
 
 
-def present_rank(alarm: Alarm) -> tuple[bool, int]:
-    """Sort key for the present severity of an alarm: shelved ones lowest, 0 if back in limits."""
-    severity = alarm.current_severity
-    return alarm.state != "shelved", 0 if severity is None else Severity[severity.upper()]
+def present_rank(alarm: Alarm) -> tuple[bool, int, int]:
+    """Sort key of an alarm: shelved ones lowest, then present severity, then excess over the bound.
+
+    The excess is counted in doublings of the bound, so that alarms about as far out are equal:
+    where the stars of one tracker go wrong, those of another soon leave their limits by less.
+    """
+    if alarm.current_severity is None:
+        return alarm.state != "shelved", 0, 0
+    severity = Severity[alarm.current_severity.upper()]
+    return alarm.state != "shelved", severity, _doublings_beyond(alarm)
+
+
+def _doublings_beyond(alarm: Alarm) -> int:
+    """Number of doublings by which the latest value of an alarm is beyond its bound."""
+    value, bound = alarm.latest.value, alarm.raised.bound
+    if min(value, bound) <= 0 or not math.isfinite(value):
+        return 0
+    doublings = math.log2(value / bound)
+    # The bound is that of the worst severity so far: the worst value tells on which side it is.
+    return max(0, int(doublings if alarm.worst.value >= bound else -doublings))
 
 
 def summary(found: Sequence[Alarm]) -> AlarmSummary:
