@@ -78,7 +78,7 @@ def test_a_silent_spacecraft_is_not_good_and_says_for_how_long(browser, tmp_path
     fleet.fill(app, 8, silent="SAT-000")
     row = "document.querySelector('.fleet tbody [href$=\"/SAT-000\"]').closest('tr')"
     cut = (
-        "[...document.querySelectorAll('.c-latest a, .c-behind')]"
+        "[...document.querySelectorAll('.c-latest a, .c-behind, .fleet .number, .c-worst')]"
         ".filter(e => e.offsetParent && e.scrollWidth > e.clientWidth + 1).length"
     )
     with Server(create_app(app)) as address:
