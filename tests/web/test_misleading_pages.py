@@ -111,6 +111,14 @@ def test_of_equal_alarms_the_one_far_beyond_its_limit_stands_before_a_newer_one(
     assert [each.tracker for each in item.alarms][:2] == ["STARTRACKER_1", "STARTRACKER_2"]
 
 
+def test_the_list_of_alarms_begins_with_the_worst_now(small_fleet):
+    app, client = small_fleet
+    page = client.get("/alarms").raise_for_status().text
+    shown = re.findall(r'href="/alarms/([0-9A-Z]{26})"', page)
+    first, *_ = app.spacecraft.alarms("live")
+    assert next(each for each in shown if each) == first.id
+
+
 # ---- finding a batch by its time -----------------------------------------------------------------
 
 

@@ -73,7 +73,7 @@ class AlarmsQuery(SortedQuery):
     state: State = "active"
     spacecraft: Key | Literal[""] = ""
     severity: SeverityName | Literal[""] = ""
-    sort: Order = "last"
+    sort: Order = "severity"
     group: Grouping = ""
     cursor: Cursor = None
 
