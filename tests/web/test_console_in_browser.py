@@ -710,6 +710,36 @@ def test_no_label_of_a_star_stands_over_another_one(
     assert browser.complaints == []
 
 
+@pytest.mark.parametrize(
+    ("page", "content"),
+    [
+        ("/spacecraft/XTE/files", "#attitudes + div tbody tr"),
+        ("/advice/XTE", ".advice p, .advice li"),
+        ("/docs", "#contents + dl a"),
+        ("/batches/{}", "[aria-labelledby=trackers] tbody tr, .sky-chart, .note"),
+        ("/alarms", "#alarms tbody tr, #alarms .empty"),
+        ("/runs", "#runs tbody tr"),
+        ("/about", "#well + div tbody tr"),
+        ("/audit", "#list tbody tr, #list .empty"),
+    ],
+)
+def test_content_begins_in_the_first_500_pixels_of_a_narrow_page(
+    browser, address, client, full_run, page, content
+):
+    """Of batches in each state: their notes and warnings stand above the star field."""
+    states = {}
+    for name in ("XTE", "SOHO") if "{}" in page else ():
+        query = {"run": full_run, "spacecraft": name}
+        for each in client.get("/api/v1/batches", params=query).json()["items"]:
+            states[name, each["status"], each["counts"]["ambiguous"] > 0] = each["id"]
+    for id in states.values() or [""]:
+        browser.open(f"{address}{page.format(id)}?run={full_run}", width=400)
+        first = f"[...document.querySelectorAll({json.dumps('main ' + content)})]"
+        top = f"{first}.find(each => each.checkVisibility()).getBoundingClientRect().top"
+        assert browser.run(top) < 500, text(browser)
+    assert browser.complaints == []
+
+
 OFFLINE = {"offline": True, "latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
 
 

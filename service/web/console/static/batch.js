@@ -27,6 +27,7 @@ async function draw(where) {
     const fresh = await fetchPage(where);
     if (mine !== asked) return;
     history.replaceState(null, "", where);
+    fresh.getElementById("settings").open = document.getElementById("settings").open;
     outcome.replaceWith(document.adoptNode(fresh.getElementById("outcome")));
     if (focus) document.getElementById(focus)?.focus({ preventScroll: true });
   } catch (error) {
