@@ -561,24 +561,25 @@ def test_a_batch_is_found_by_the_id_of_its_sender_or_by_a_time(client, full_run)
     assert "No batch no-such-batch" in text_of(missing)
 
 
-def test_files_of_attitudes_say_what_each_grade_is_and_how_many_stretches(tmp_path):
+def test_files_of_attitudes_say_what_each_grade_is_and_how_many_intervals(tmp_path):
     app = open_app(in_process_settings(f"sqlite:///{tmp_path / 'acquire.db'}"))
     with Server(create_app(app)) as address, httpx.Client(base_url=address, timeout=60) as client:
         batches = [each.batch for each in draw_pass(app.missions["XTE"], app.sky, STEADY)]
         for each in batches:
             client.post("/api/v1/batches", json=each).raise_for_status()
         text = text_of(client.get("/spacecraft/XTE/files"))
-        assert re.search(r"raw 16 1 12\Dmin\D30\Ds", text), text
+        assert re.search(r"raw 16 1 1999-03-01 \(060\) 00:00:00 to 1999-03-01 \(060\) 01:15", text)
+        assert re.search(r"automatic: 12\Dmin\D30\Ds for raw attitudes", text), text
         assert "The definitive attitude" in text
         # The gap follows the cadence, so that an AEM of a steady cadence is one segment.
         aem = client.get("/api/v1/spacecraft/XTE/attitude", params={"format": "aem"}).text
         assert aem.count("META_START") == 1
         page = text_of(client.get("/spacecraft/XTE/files", params={"gap_s": "60"}))
-        assert "16 stretches for 16 attitudes" in page
+        assert "16 intervals for 16 attitudes" in page
         assert "15 times after a gap longer than 1 min (choose a larger one below" in page
 
 
-def test_files_of_a_day_say_which_stretches_no_larger_gap_would_join(tmp_path):
+def test_files_of_a_day_say_which_intervals_no_larger_gap_would_join(tmp_path):
     app = open_app(in_process_settings(f"sqlite:///{tmp_path / 'acquire.db'}"))
     asked = replace(STEADY, start="1999-03-01T12:10:00.000Z", batches=24, cadence_s=HOUR_S)
     with Server(create_app(app)) as address, httpx.Client(base_url=address, timeout=60) as client:
@@ -586,7 +587,7 @@ def test_files_of_a_day_say_which_stretches_no_larger_gap_would_join(tmp_path):
             client.post("/api/v1/batches", json=each.batch).raise_for_status()
         files, day = "/spacecraft/XTE/files", {"day": "1999-03-01", "gap_s": "7200"}
         page = client.get(files, params=day)
-        assert re.search(r"raw 12 \d+ 2\Dh", text_of(page)), text_of(page)
+        assert re.search(r"raw 12 \d+ 1999-03-01 \(060\) 12:10:00 to", text_of(page)), text_of(page)
         told = re.search(r"begins (\d+) times after a turn of more than 90°", text_of(page))
         assert told, text_of(page)
         assert "choose a larger one" not in text_of(page)
@@ -594,5 +595,10 @@ def test_files_of_a_day_say_which_stretches_no_larger_gap_would_join(tmp_path):
         aem = client.get(link).raise_for_status().text
         assert aem.count("META_START") == 1 + int(told[1])
         assert {each[:10] for each in re.findall(r"^1999\S+", aem, re.MULTILINE)} == {"1999-03-01"}
+        # The day of the latest batch is shown first, and the day before it is a link away.
+        first = client.get(files).text
+        assert 'value="1999-03-02"' in first
+        day_before = html.unescape(re.search(r'href="([^"]+)">◀ Day before', first)[1])
+        assert 'value="1999-03-01"' in client.get(day_before).text
         assert client.get(files, params={"day": "yesterday"}).status_code == 422
         assert client.get(files, params={"day": "9999-12-31"}).status_code in (200, 422)

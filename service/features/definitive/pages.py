@@ -9,10 +9,16 @@ from service.features.definitive.charts import definitive_charts, innovation_cha
 from service.features.definitive.part import Definitive
 from service.features.definitive.period import DefinitivePeriod
 from service.storage.queries.definitive import MOST_BLOCKS
+from service.times import DAY_S, Utc, bucket_start, shifted
 from service.web.console.charts.panels import TimeAxis
 from service.web.console.page import ContextDep, FromQuery, console_page
 from service.web.console.pages.period import without_gyro
-from service.web.console.pages.spacecraft_page import RANGES_S, SpacecraftQuery, shown_period
+from service.web.console.pages.spacecraft_page import (
+    RANGES_S,
+    ShownPeriod,
+    SpacecraftQuery,
+    shown_period,
+)
 from service.web.requests.access import Policy
 
 JOBS = 8
@@ -56,9 +62,17 @@ def definitive_page(name: str, query: FromQuery[SpacecraftQuery], context: Conte
         query.run,
         name=name,
         missing=without_gyro(context, name, query.run, shown) if shown else "",
+        whole_days=_whole_days(shown) if shown else (),
         stretch=shown,
         ranges=list(RANGES_S),
         drawn=drawn,
         most_blocks=MOST_BLOCKS,
         jobs=definitive.jobs.all(name)[:JOBS],
     )
+
+
+def _whole_days(shown: ShownPeriod) -> tuple[Utc, Utc]:
+    """Beginning and end of the UTC days that a period touches; of a day up to now, the last one."""
+    last = shifted(shown.end, -0.001).bucket(DAY_S)
+    first = last if shown.range == "day" else shown.start.bucket(DAY_S)
+    return bucket_start(first, DAY_S), bucket_start(last + 1, DAY_S)

@@ -14,16 +14,11 @@ from service.features.products.attitudes import AttitudeSeries, ProductGrade, tu
 from service.features.products.part import TABLE_KINDS, Products
 from service.missions.product_settings import MAX_LARGEST_GAP_S
 from service.table_files.formats import TABLE_FORMATS
-from service.times import DAY_S, bucket_start
+from service.times import DAY_S, Utc, bucket_start, parse_utc, shifted
 from service.web.console.formatting import completed_utc
 from service.web.console.page import ContextDep, FromQuery, PageContext, console_page
 from service.web.console.pages.period import without_gyro
-from service.web.console.pages.spacecraft_page import (
-    RANGES_S,
-    ShownPeriod,
-    SpacecraftQuery,
-    shown_period,
-)
+from service.web.console.pages.spacecraft_page import ShownPeriod, SpacecraftQuery, shown_period
 from service.web.requests.access import Policy
 from service.web.requests.query_parameters import Start
 
@@ -43,7 +38,8 @@ FEW_PER_STRETCH = 10
 class FilesQuery(SpacecraftQuery):
     """Query of the files page: period and largest gap; empty: from the mission or the cadence.
 
-    A `day` in UTC is the period in place of the other parameters.
+    A `day` in UTC is the period in place of the other parameters; without any it is the day of the
+    latest batch.
     """
 
     gap_s: Annotated[float | None, Field(gt=0, le=MAX_LARGEST_GAP_S)] = None
@@ -64,7 +60,8 @@ class FilesQuery(SpacecraftQuery):
 class GradeOfFile:
     """Summary of one grade of attitudes in a period: number, intervals, largest gap.
 
-    `missing` is the reason for having none, if known.  Intervals begin `after_turns` of more than
+    `covers` are the times of the first and the last attitude.  `missing` is the reason for having
+    none, if known.  Intervals begin `after_turns` of more than
     a quarter turn, `after_missing` attitudes of batches between, and `after_gaps` that are too
     long; each counts for the first of these reasons.
 
@@ -74,6 +71,7 @@ class GradeOfFile:
     grade: ProductGrade
     what: str
     missing: str
+    covers: tuple[Utc, Utc] | None
     attitudes: int
     after_turns: int
     after_missing: int
@@ -91,14 +89,24 @@ class GradeOfFile:
         """True if a file has several intervals, and more than a tenth as many as attitudes."""
         return self.stretches * FEW_PER_STRETCH > self.attitudes and self.stretches > 1
 
+    def ends_before(self, other: "GradeOfFile") -> bool:
+        """True if another grade has attitudes that are later by more than the largest gap."""
+        if self.covers is None or other.covers is None:
+            return False
+        later_s = (other.covers[1].tai_ns - self.covers[1].tai_ns) / 1e9
+        return later_s > max(self.largest_gap_s, other.largest_gap_s)
+
 
 @console_page("/spacecraft/{name}/files", "Files", Policy("read", "path"), section="/")
 def files_page(name: str, query: FromQuery[FilesQuery], context: ContextDep) -> Response:
     """Console page with export files of a period: attitudes by grade and format, and tables."""
     context.app.context.mission(name)
-    if query.day:
-        number = query.day.bucket(DAY_S)
-        start, end = (bucket_start(each, DAY_S) for each in (number, number + 1))
+    day = query.day
+    if day is None and not (query.range or query.start or query.end):
+        latest = context.app.results.page(spacecraft=name, run=query.run, limit=1).items
+        day = parse_utc(latest[0].time) if latest else None
+    if day:
+        start, end = (bucket_start(day.bucket(DAY_S) + each, DAY_S) for each in (0, 1))
         query = query.model_copy(update={"range": None, "start": start, "end": end})
     shown = shown_period(context, name, query)
 
@@ -120,7 +128,7 @@ def files_page(name: str, query: FromQuery[FilesQuery], context: ContextDep) -> 
         name=name,
         query=query,
         stretch=shown,
-        ranges=list(RANGES_S),
+        days=_days(shown.start) if shown else {},
         grades=_grades(context, name, query, shown) if shown else [],
         attitude_formats=attitude_formats(),
         formats=TABLE_FORMATS,
@@ -145,14 +153,35 @@ def _grades(
             grade=grade,
             largest_gap_s=query.gap_s,
         )
-        found.append(_counted(grade, what, missing, series))
+        newest = products.attitudes(
+            name,
+            run=query.run,
+            start=shown.start,
+            end=shown.end,
+            grade=grade,
+            order="newest",
+            largest_gap_s=series.about.largest_gap_s,
+        )
+        found.append(_counted(grade, what, missing, series, newest))
     return found
 
 
-def _counted(grade: ProductGrade, what: str, why_none: str, series: AttitudeSeries) -> GradeOfFile:
+def _days(shown: Utc) -> dict[str, str]:
+    """Date of a shown day and its neighbours, as in an address."""
+    at = {"before": -DAY_S, "shown": 0.0, "after": DAY_S}
+    return {name: shifted(shown, offset_s).text[:10] for name, offset_s in at.items()}
+
+
+def _counted(
+    grade: ProductGrade, what: str, why_none: str, series: AttitudeSeries, newest: AttitudeSeries
+) -> GradeOfFile:
+    """Summary of a series of attitudes; `newest` has the same, the latest first."""
+    covers = None
     attitudes = after_turns = after_missing = after_gaps = 0
     last = None
     for block in islice(series.blocks, MOST_COUNTED):
+        if covers is None:
+            covers = parse_utc(block.time[0]), parse_utc(next(iter(newest.blocks)).time[0])
         attitudes += len(block)
         rows = block if last is None else last.followed_by(block)
         begins = np.diff(rows.stretch) != 0
@@ -167,6 +196,7 @@ def _counted(grade: ProductGrade, what: str, why_none: str, series: AttitudeSeri
         grade,
         what,
         "" if grade == "raw" else why_none,
+        covers,
         attitudes,
         after_turns,
         after_missing,

@@ -232,6 +232,33 @@ def test_no_line_of_the_boresight_crosses_the_wrap_at_360_degrees():
     assert [text for _, text in app_axis.ticks()] == [f"12:0{minute}" for minute in (5,)]
 
 
+def test_files_say_that_a_grade_ends_before_the_batches_and_jobs_link_their_files(
+    tmp_path, missions
+):
+    rng = np.random.default_rng(11)
+    truth = truth_of(slews, 7200.0)
+    gyro, _ = gyro_of(truth, MODEL, rng)
+    settings = in_process_settings(sqlite_at(tmp_path / "acquire.db"))
+    app = open_app(settings, mission_with(missions["XTE"], gyro=GYRO))
+    with Server(create_app(app)) as address, httpx.Client(base_url=address, timeout=60) as client:
+        first = gyro.tai_ns < gyro.tai_ns[0] + 1800 * 10**9
+        early = attitudes_of(truth, np.arange(0, 1800, 8), (6.0, 6.0, 40.0), rng)
+        put_pass(app, recorded_of(gyro.tai_ns[first], gyro.rate_rad_s[first], early))
+        jobs = "/api/v1/spacecraft/XTE/definitive-attitude"
+        job = client.post(jobs, json={"who": "J. Operator"}).raise_for_status().json()
+        wait_until(lambda: client.get(f"{jobs}/{job['id']}").json()["state"] == "done")
+        page = client.get(PAGE).text
+        days = [f"{shifted(NOON, hours * 3600.0).text[:10]}T00:00:00Z" for hours in (0, 24)]
+        for field, day in zip(("start", "end"), days, strict=True):
+            assert re.search(rf'name="{field}"[^>]* value="{day}"', page), page
+        link = html.unescape(re.search(r'revision; <a href="([^"]+)">files</a>', page)[1])
+        assert "It ends before" not in client.get(link).text
+        late = attitudes_of(truth, np.arange(6000, 6800, 8), (6.0, 6.0, 40.0), rng)
+        put_pass(app, recorded_of(gyro.tai_ns[~first], gyro.rate_rad_s[~first], late))
+        text = text_of(client.get(link).text)
+        assert text.count("It ends before the last batch with a good attitude") == 2, text
+
+
 @in_browser
 def test_a_chart_is_read_at_a_moment_and_zoomed_by_dragging(browser, address):
     browser.open(f"{address}{PAGE}?run=pass")
