@@ -470,6 +470,7 @@ def test_without_gyro_data_the_pages_say_what_is_missing_and_link_no_file_that_i
         assert before.count("There are no gyro data in this period") == 1
         app.part(Definitive).days.smooth("XTE")
         after = client.get("/spacecraft/XTE/grades").text
+        assert after.count("There are no gyro data in this period") == 1
         files = client.get("/spacecraft/XTE/files").text
         assert "▲ None is good." in files
         assert files.count("There are no gyro data in this period") == 1

@@ -26,6 +26,17 @@ def test_a_problem_that_was_answered_leads_there(client, post, batch):
     assert problem.json()["title"] in text_of(client.get(leads_to))
 
 
+def test_a_page_that_fails_says_so_on_a_page(app, client, monkeypatch):
+    def fail(*_):
+        raise RuntimeError("no such luck")
+
+    monkeypatch.setattr(app.service, "about", fail)
+    page = client.get("/about")
+    assert (page.status_code, page.headers["content-type"][:9]) == (500, "text/html")
+    assert "The service has failed; its log contains the cause." in text_of(page)
+    assert "no such luck" not in page.text
+
+
 def test_all_are_listed_and_each_links_to_its_own(client):
     page = client.get("/problems").text
     assert re.findall(r'href="(/problems/[\w-]+)"', page) == [

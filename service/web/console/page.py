@@ -419,13 +419,22 @@ class PageRoute(APIRoute):
                 return below_path(request, page)
             except AcquisitionError as error:
                 if (kind := problems.problem_type_of(error)) is problems.INTERNAL_ERROR:
-                    raise
+                    return _failed(request, error)
                 answer = _error_page(kind, problem_of(error))
                 if isinstance(error, Busy):
                     answer.headers["Retry-After"] = str(error.retry_after_s)
                 return below_path(request, answer)
+            except HTTPException:
+                raise
+            except Exception as error:
+                return _failed(request, error)
 
         return handler
+
+
+def _failed(request: Request, error: Exception) -> Response:
+    problems.internal_error(request, error)
+    return below_path(request, _error_page(problems.INTERNAL_ERROR, problems.FAILED))
 
 
 async def page_or_problem(request: Request, error: Exception) -> Response:

@@ -3,6 +3,7 @@
 import html
 import re
 from dataclasses import replace
+from itertools import pairwise
 from types import SimpleNamespace
 
 import httpx
@@ -205,6 +206,22 @@ def test_the_route_names_what_is_wrong(address, asked, status, named):
 def test_it_fits_and_axe_finds_no_fault(address, run, browser):
     assert_fits(browser, f"{address}{PAGE}?run={run}")
     assert browser.complaints == []
+    browser.call("Page.navigate", url="about:blank")
+
+
+@in_browser
+def test_no_label_of_a_panel_stands_over_another_one(browser, address):
+    browser.open(f"{address}{PAGE}?run=pass")
+    boxes = browser.run(
+        "[...document.querySelectorAll('.plot-axes')].map(plot => "
+        "[...plot.querySelectorAll('text')].map(each => [each.getBBox().y, each.getBBox().height]))"
+    )
+    assert max(map(len, boxes)) > 2
+    for labels in map(sorted, boxes):
+        # A box holds the room above and below the letters, too.
+        assert all(a + 0.8 * high <= b for (a, high), (b, _) in pairwise(labels)), labels
+    sections = "[...document.querySelectorAll('section:has(.plot)')]"
+    assert browser.run(f"{sections}.every(each => each.querySelector('[data-picture]'))")
     browser.call("Page.navigate", url="about:blank")
 
 
