@@ -11,6 +11,7 @@ from starlette.responses import Response
 
 from service.features.advice.part import AdviceService, best_setting, no_changes_text
 from service.features.advice.routes import ADVICE_LIMIT_S, MAX_SAMPLE, AdviceQuery
+from service.features.advice.text import mission_lines
 from service.missions.mission import Tolerances
 from service.web.console.options import SYMBOLS
 from service.web.console.page import ContextDep, FromQuery, PageContext, Panel, console_page
@@ -84,6 +85,7 @@ def advice_page(name: str, query: FromQuery[AdviceForm], context: ContextDep) ->
         ),
         max_sample=MAX_SAMPLE,
         tolerances=list(Tolerances.model_fields),
+        mission_lines=mission_lines(advice),
         no_changes=no_changes_text(advice),
     )
 

@@ -74,13 +74,16 @@ def _changes(advice: Advice) -> list[str]:
     """Lines to change in the mission file as text, grouped by table."""
     if not advice.changes:
         return [no_changes_text(advice)]
-    lines = [f"To change in the mission file of {advice.spacecraft}:"]
-    place = None
-    for each in sorted(advice.changes, key=lambda change: (change.table, change.tracker or "")):
-        if (each.table, each.tracker) != place:
-            place = each.table, each.tracker
-            lines.append(
-                f"  [[trackers]]   of {each.tracker}" if each.tracker else f"  [{each.table}]"
-            )
-        lines.append(f"  {each.line}")
-    return lines
+    heading = f"To change in the mission file of {advice.spacecraft}:"
+    return [heading, textwrap.indent(mission_lines(advice), "  ")]
+
+
+def mission_lines(advice: Advice) -> str:
+    """Recommended lines of the mission file as TOML, grouped by table."""
+    tables: dict[tuple[str, str], list[str]] = {}
+    for each in advice.changes:
+        tables.setdefault((each.table, each.tracker or ""), []).append(each.line)
+    return "\n".join(
+        "\n".join([f'[[trackers]]\nname = "{tracker}"' if tracker else f"[{table}]", *lines])
+        for (table, tracker), lines in sorted(tables.items())
+    )
