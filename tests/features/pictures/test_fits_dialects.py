@@ -114,6 +114,11 @@ TIMES = {
     "TT": ({"DATE-AVG": "2026-03-01T12:01:09.184", "TIMESYS": "TT"}, {}, 0.0),
     "TT(BIPM)": ({"DATE-AVG": "2026-03-01T12:01:09.184", "TIMESYS": "TT(BIPM08)"}, {}, 0.0),
     "GPS": ({"DATE-AVG": "2026-03-01T12:00:18", "TIMESYS": "GPS"}, {}, 0.0),
+    "milliseconds in a card of the unit": (
+        {"DATE-OBS": NOON, "EXPTIME": 4000, "EXPUNIT": "ms"},
+        {},
+        2.0,
+    ),
     "milliseconds in words": (
         {"DATE-OBS": NOON, "EXPTIME": (4000, "exposure time in milliseconds")},
         {},
@@ -281,6 +286,14 @@ NO_TIMES = {
     "a unit of all and another one": (
         {"DATE-OBS": NOON, "XPOSURE": (500, "in ms"), "TIMEUNIT": "s"},
         "its comment says otherwise",
+    ),
+    "a unit in a card and another one in the comment": (
+        {"DATE-OBS": NOON, "EXPTIME": (500, "[s]"), "EXPUNIT": "ms"},
+        "EXPTIME is 500 ms, and its comment says otherwise",
+    ),
+    "two units of one exposure": (
+        {"DATE-OBS": NOON, "EXPTIME": "500 s", "EXPUNIT": "ms"},
+        "EXPTIME is 500 s ms: units that contradict each other",
     ),
     "exposures a thousand times apart": (
         {"DATE-OBS": NOON, "XPOSURE": 0.5, "EXPTIME": 500.0},

@@ -17,6 +17,8 @@ from service.features.pictures.frames.fits_header import Header
 from service.times import DAY_S, TT_LESS_TAI_S, Utc, parse_utc, recorded_utc, shifted
 
 EXPOSURES = ("XPOSURE", "EXPTIME", "EXPOSURE")
+EXPOSURE_UNITS = ("EXPUNIT", "EXPUNITS", "EXP_UNIT", "EXPTUNIT")
+"""FITS keywords of the unit of exposures, outside the standard."""
 AVERAGES, STARTS, ENDS = (
     ("DATE-AVG", "MJD-AVG"),
     ("DATE-BEG", "DATE-OBS", "MJD-BEG", "MJD-OBS"),
@@ -206,11 +208,14 @@ def _seconds(header: Header, key: str) -> tuple[float, str]:
         number, unit = repr(value), ""
     else:
         raise ValueError(f"{key} is no number")
-    common = header.cards.get("TIMEUNIT") if key == "XPOSURE" else None
-    own = [_scale_of_unit(each, key) for each in (unit, str(common or "").strip()) if each]
+    cards = (*EXPOSURE_UNITS, *(("TIMEUNIT",) if key == "XPOSURE" else ()))
+    common = [str(header.cards[each]).strip() for each in cards if header.cards.get(each)]
+    own = [_scale_of_unit(each, key) for each in (unit, *common) if each]
     stated = _stated_scales(comment, key)
+    shown = " ".join([str(value), *common])
+    if len(set(own)) > 1:
+        raise _Contradictory(f"{key} is {shown}: units that contradict each other")
     if len(stated) > 1 or (own and stated and own[0] not in stated):
-        shown = f"{value} {common or ''}".strip()
         raise _Contradictory(f"{key} is {shown}, and its comment says otherwise: {comment[:60]}")
     scale = own[0] if own else next(iter(stated), 1.0)
     seconds = float(number) * scale
