@@ -321,7 +321,7 @@ def test_every_chart_of_every_page_is_saved_in_the_same_way(browser, address, cl
 
 
 def test_the_read_out_of_a_trend_has_the_value_of_every_line(browser, address, client, drawn, run):
-    """Those of another spacecraft and of the day before, whose batches have times of their own."""
+    """Another spacecraft and the day before have batches at other times."""
     for name, day, second in (("XTE", "03-01", 0), ("SOHO", "03-01", 15), ("XTE", "02-28", 8)):
         for k, batch in enumerate(drawn(name, 20, seed=4)):
             time_of_day = f"00:{k // 2:02}:{second + 30 * (k % 2):02}"
@@ -726,7 +726,7 @@ def test_no_label_of_a_star_stands_over_another_one(
 def test_content_begins_in_the_first_500_pixels_of_a_narrow_page(
     browser, address, client, full_run, page, content
 ):
-    """Of batches in each state: their notes and warnings stand above the star field."""
+    """Batches of each state, with the notes and warnings that stand above their star field."""
     states = {}
     for name in ("XTE", "SOHO") if "{}" in page else ():
         query = {"run": full_run, "spacecraft": name}
@@ -738,6 +738,23 @@ def test_content_begins_in_the_first_500_pixels_of_a_narrow_page(
         top = f"{first}.find(each => each.checkVisibility()).getBoundingClientRect().top"
         assert browser.run(top) < 500, text(browser)
     assert browser.complaints == []
+
+
+def test_a_long_reason_leaves_room_for_the_other_columns(browser, address, client):
+    note = {"start": "1999-03-01T00:10:00Z", "text": "Wheel 2 unloaded; " * 60 + "end", "who": "jb"}
+    client.post("/api/v1/annotations", json=note).raise_for_status()
+    browser.open(f"{address}/audit?action=annotation")
+    shows(browser, "Wheel 2 unloaded")
+    narrow = "[...document.querySelectorAll('#list td.wide')].filter(e => e.offsetWidth < 100)"
+    assert browser.run(f"{narrow}.map(each => each.innerText)") == []
+
+
+def test_settings_of_several_missions_are_folded_and_those_of_one_are_not(browser, address):
+    opened = "[...document.querySelectorAll('[id^=settings-]')].filter(each => each.open).length"
+    browser.open(f"{address}/missions", width=400)
+    assert browser.run(opened) == 0
+    browser.open(f"{address}/missions?spacecraft=XTE", width=400)
+    assert browser.run(opened) == 1
 
 
 OFFLINE = {"offline": True, "latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
@@ -792,7 +809,7 @@ def test_a_replay_is_cancelled_and_continued_where_its_row_is(browser, address, 
 
 
 def test_replays_of_every_run_are_followed_where_they_are_listed(browser, address, client, batch):
-    """Their lines are counted on, and their ends told, while the page shows the live batches."""
+    """The rows count lines and tell the end while live batches are the chosen run."""
     lines = "".join(json.dumps(batch | {"batch": f"followed-{k}"}) + "\n" for k in range(3_000))
     browser.open(f"{address}/runs")
     browser.wait(lambda: browser.run(CONNECTED))
@@ -825,7 +842,7 @@ def test_replays_of_every_run_are_followed_where_they_are_listed(browser, addres
 def test_the_reason_why_a_replay_cannot_be_cancelled_stays_in_sight(
     browser, address, client, batch
 ):
-    """The row is of before its end; the reason is in the window, and the row then says the end."""
+    """The row dates from before the end of the replay; after the refusal it says the end."""
     run = f"over-{next(_numbers)}"
     lines = "".join(json.dumps(batch | {"batch": f"{run}-{k}"}) + "\n" for k in range(2_000))
     answer = client.post(

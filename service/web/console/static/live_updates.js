@@ -26,7 +26,7 @@ const POLL_MS = 10000;
 
 const shown = document.getElementById("connection");
 const run = document.body.dataset.run;
-// Such a page shows the replays of every run.
+// True for pages that list replays of every run.
 const isOfEveryRun = document.querySelector("[data-every-run]") !== null;
 let source = null;
 let last = document.body.dataset.lastEvent || null;

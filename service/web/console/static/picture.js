@@ -2,7 +2,7 @@
 import { element } from "./actions.js";
 import { posix, utc } from "./times.js";
 
-const LEFT_OUT = "svg, details, h2, .button, .hide, [data-picture], [aria-pressed=false]";
+const LEFT_OUT = "svg, details, h2, .button, .hide, [role=status], [data-picture], [aria-pressed=false]";
 const LINE_PX = 20;
 const MARGIN_PX = 12;
 const fontOf = ({ fontWeight, fontSize, fontFamily }) => `${fontWeight} ${fontSize} ${fontFamily}`;
@@ -34,15 +34,14 @@ function drawShape(pen, shape, toSheet) {
     pen.fillText(shape.textContent, x, y);
     return;
   }
-  let path = outline(shape);
+  const path = outline(shape);
   if (fill !== "none") pen.fill(path);
-  if (style.vectorEffect === "non-scaling-stroke") {
-    const drawn = path;
-    path = new Path2D();
-    path.addPath(drawn, toPage);
-    pen.setTransform(toSheet);
-  }
-  if (stroke !== "none") pen.stroke(path);
+  if (stroke === "none") return;
+  const onPage = new Path2D();
+  onPage.addPath(path, toPage);
+  const isRigid = style.vectorEffect === "non-scaling-stroke";
+  if (isRigid) pen.setTransform(toSheet);
+  pen.stroke(isRigid ? onPage : path);
 }
 
 function drawSvg(pen, svg, toSheet) {
@@ -78,10 +77,10 @@ function save(button) {
   const label = section.ariaLabel ?? words(document.getElementById(section.getAttribute("aria-labelledby")));
   const title = [label, button.dataset.picture].filter(Boolean).join(": ");
   const { start, end } = document.querySelector("main [data-start]")?.dataset ?? {};
-  const period = [start, end].filter(Boolean).map((each) => utc(posix(each)));
+  const period = [start, end].filter(Boolean).map((each) => utc(posix(each))).join(" to ");
   const { run } = document.body.dataset;
   const page = words(document.querySelector("h1"));
-  const heading = [`${page}: ${title}`, [`Run ${run}`, ...(period.length ? [`${period.join(" to ")} UTC`] : [])].join(", ")];
+  const heading = [`${page}: ${title}`, `Run ${run}${period && `, ${period} UTC`}`];
   const { left, width, ...box } = whole.getBoundingClientRect().toJSON();
   const top = whole.querySelector(":scope > h2")?.getBoundingClientRect().bottom ?? box.top;
   const pen = element("canvas").getContext("2d");
