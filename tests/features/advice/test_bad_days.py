@@ -69,7 +69,7 @@ def test_the_one_setting_stands_behind_the_remedy_of_the_cause(pages, case):
     if " ambiguous instead of " not in best:
         assert "No single setting of the identifier" in best
     elif case.cause:
-        assert f"First mend the cause in the last day: {case.cause} →" in best
+        assert f"The cause in the last day comes first: {case.cause} →" in best
         assert best.index("→") < best.index(" ambiguous instead of ")
     else:
-        assert "First mend the cause" not in best
+        assert "comes first" not in best
