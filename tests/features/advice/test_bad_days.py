@@ -44,7 +44,8 @@ def test_the_change_leads_to_its_cause_and_to_the_same_figures(pages, case):
     title = re.search(r'before=day[^>]*title="([^"]*)"', row)[1]
     panel = text_of(re.search(r'<div id="why".*?</section>', page, re.DOTALL)[0])
     told = re.search(
-        rf"ambiguous stars \w+ before.*?: (\S+) points, {STARS}.*?, before {STARS}", panel
+        rf"ambiguous stars \w+ before.*?: (\S+) percentage points, {STARS}.*?, before {STARS}",
+        panel,
     )
     assert told, panel
     assert f"{told[1]} in {told[3]}" in text_of(row)
