@@ -341,6 +341,18 @@ def test_the_read_out_of_a_trend_has_the_value_of_every_line(browser, address, c
         for line in (r"UTC: XTE: ambiguous stars \d", r", SOHO: ambiguous stars \d"):
             assert re.search(line, read), read
         assert re.search(r", XTE: ambiguous stars, 1 d before \d", read), read
+    # Where the pointer has left, the read-out keeps its height, and the chart its place.
+    browser.open(browser.run("location.href"), width=400)
+    browser.wait(lambda: browser.run(DRAWN))
+    top = "document.querySelector('[data-chart=stars]').getBoundingClientRect().top"
+    for x in (200, 210):
+        place = {"x": x, "y": browser.run(top) + 90}
+        browser.call("Input.dispatchMouseEvent", type="mouseMoved", **place)
+    assert "1 d before" in text(browser, "[data-readout=stars]")
+    before = browser.run(top)
+    browser.call("Input.dispatchMouseEvent", type="mouseMoved", x=5, y=5)
+    browser.wait(lambda: "UTC: XTE" not in text(browser, "[data-readout=stars]"))
+    assert abs(browser.run(top) - before) < 1
     assert browser.complaints == []
 
 
@@ -844,7 +856,7 @@ def test_the_reason_why_a_replay_cannot_be_cancelled_stays_in_sight(
 ):
     """The row dates from before the end of the replay; after the refusal it says the end."""
     run = f"over-{next(_numbers)}"
-    lines = "".join(json.dumps(batch | {"batch": f"{run}-{k}"}) + "\n" for k in range(2_000))
+    lines = "".join(json.dumps(batch | {"batch": f"{run}-{k}"}) + "\n" for k in range(4_000))
     answer = client.post(
         "/api/v1/replays",
         params={"run": run, "name": run},

@@ -386,6 +386,8 @@ export class Trend {
       return `${this.nameOf(other)} ${this.text(this.data[column][this.nearest(column, index, other)])}`;
     });
     this.readout.textContent = `${utc(this.data[0][index])} UTC: ${[...parts, ...beside].join(", ")}`;
+    // A shorter text leaves the chart where it is below the pointer.
+    this.readout.style.minHeight = `${this.readout.offsetHeight}px`;
   }
 
   // Spacecraft have times of their own: the place of a column's value nearest in time, within the usual step of its history.
