@@ -22,6 +22,7 @@ import msgspec
 from service.acquire.kernel_build import KernelBuild, kernel_progress
 from service.child_processes import command_of
 from service.errors import BadConfiguration, BadInput, Busy, Fault
+from service.feature import features_on
 from service.missions.mission import load_missions
 from service.replay.items import items_of
 from service.replay.over_http import GIVE_UP_AFTER_S, replay_over_http
@@ -175,14 +176,17 @@ def _where_next(
         )
     yield f"{folder}/*.results.ndjson", "every answer; the truth is in *.truth.ndjson beside it"
     stopped = "" if once else "with this server stopped: "
-    yield (
-        f"acquire smooth XTE --run {run} --database {settings.database}",
-        f"{stopped}filter and smooth XTE with its gyro; its page Definitive attitude draws it",
-    )
-    yield (
-        "acquire frame PICTURE",
-        "any picture of the sky, from any camera: its attitude, its lens, the names of its stars",
-    )
+    installed = {each.name for each in features_on(settings.features_off)}
+    if "definitive" in installed:
+        yield (
+            f"acquire smooth XTE --run {run} --database {settings.database}",
+            f"{stopped}filter and smooth XTE with its gyro; its page Definitive attitude draws it",
+        )
+    if "pictures" in installed:
+        yield (
+            "acquire frame PICTURE",
+            "any picture of the sky, from any camera: attitude, lens, and names of its stars",
+        )
     # An installed wheel has no documents.
     if shipped("docs", "quickstart.md").is_file():
         yield "docs/quickstart.md", "a walk: post a batch, read the attitude, try other tolerances"

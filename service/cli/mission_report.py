@@ -169,13 +169,13 @@ def _sentences(report: MissionReport) -> list[str]:
         lines.append("The mission is lost in space: each batch is sought in the whole sky.")
     elif zone.kind == "band":
         lines.append(
-            f"The band is {zone.half_width_deg:g} deg wide to either side: the field of view of "
-            f"{field_deg:g} deg and an error of the Sun-pointed axis of {error}."
+            f"The band is {zone.half_width_deg:g} deg wide to either side: the radius of the field "
+            f"of view, {field_deg:g} deg, and an error of the Sun-pointed axis of {error}."
         )
     else:
         lines.append(
-            f"The zone of {zone.radius_deg:g} deg holds the field of view of {field_deg:g} deg and "
-            f"an a priori error of {error} about each axis."
+            f"The zone has a radius of {zone.radius_deg:g} deg: that of the field of view, "
+            f"{field_deg:g} deg, and an a priori error of {error} about each axis."
         )
     lines += [
         f"Expected in {each.sky} sky ({_LATITUDES[each.sky]} deg from the plane of the Milky Way; "

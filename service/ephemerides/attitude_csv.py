@@ -105,6 +105,9 @@ def _rows(
             if 0 < len(missing) < len(_RATES):
                 raise source.bad(line, f"column {missing[0]}", "must be there beside other rates")
             continue
+        if [each.strip().lower() for each in cells] == names:
+            message = "repeats the header: the file was appended to itself or to another"
+            raise source.bad(line, "row", message)
         if len(cells) != len(names):
             message = f"must have {len(names)} cells, as the header has"
             raise source.bad(line, "row", message, ",".join(cells))

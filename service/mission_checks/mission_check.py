@@ -105,9 +105,9 @@ def _zone(mission: Mission) -> Iterator[Finding]:
             yield Finding(
                 "unusual",
                 "zone.radius_deg",
-                f"{zone.radius_deg:g} is no more than the field of view of {widest_deg:g} deg: it "
-                "leaves no room for an error of the a priori attitude; it should be the field of "
-                "view and that error together",
+                f"{zone.radius_deg:g} is no more than the radius of the field of view, "
+                f"{widest_deg:g} deg: it leaves no room for an error of the a priori attitude; it "
+                "should be that radius and that error together",
             )
         off_deg = [separation_deg(t.boresight_body, mission.axis_body) for t in mission.trackers]
         if min(off_deg) > SAME_BORESIGHT_DEG:
@@ -122,8 +122,8 @@ def _zone(mission: Mission) -> Iterator[Finding]:
         yield Finding(
             "unusual",
             "zone.half_width_deg",
-            f"{zone.half_width_deg:g} is less than the field of view of {widest_deg:g} deg: stars "
-            "at its edge are not in the zone",
+            f"{zone.half_width_deg:g} is less than the radius of the field of view, "
+            f"{widest_deg:g} deg: stars at its edge are not in the zone",
         )
     for place, tracker in enumerate(mission.trackers):
         file_deg = tracker.coelevation_deg or zone.coelevation_deg
@@ -249,8 +249,8 @@ def _scan(key: str, tracker: Tracker) -> Iterator[Finding]:
         yield Finding(
             "unusual",
             f"{key}.scan",
-            f"reaches {reach_deg:.2f} deg from the boresight, less than the field of view of "
-            f"{radius_deg:g} deg: stars at its edge are not seen",
+            f"reaches {reach_deg:.2f} deg from the boresight, less than the radius of the "
+            f"field of view, {radius_deg:g} deg: stars at its edge are not seen",
         )
 
 

@@ -136,7 +136,7 @@ def zone_censuses(mission: Mission, run_catalog: RunCatalog) -> list[ZoneCensus]
     """Census of a mission's zones by shape: one for caps, one per coelevation for bands."""
     zone = mission.zone
     if not isinstance(zone, Band):
-        shapes = {f"cap of {zone.radius_deg:g} deg": (0.0, zone.radius_deg)}
+        shapes = {f"cap with a radius of {zone.radius_deg:g} deg": (0.0, zone.radius_deg)}
     else:
         shapes = {}
         for tracker in mission.trackers:

@@ -243,7 +243,7 @@ def _bounds(mission: Mission) -> list[tuple[str, float, float]]:
     """
     zone = mission.zone
     if not isinstance(zone, Band):
-        return [(f"cap of {zone.radius_deg:g} deg", 0.0, zone.radius_deg)]
+        return [(f"cap with a radius of {zone.radius_deg:g} deg", 0.0, zone.radius_deg)]
     half_deg = zone.half_width_deg
     middles = {each.coelevation_deg or zone.coelevation_deg for each in mission.trackers}
     return [

@@ -33,6 +33,18 @@ def test_what_the_service_exports_is_read_again(rng, tmp_path):
     np.testing.assert_allclose(known.at(wanted.time_ns), wanted.quaternion, rtol=0, atol=3e-16)
 
 
+@pytest.mark.parametrize("status", [False, True])
+def test_a_file_appended_to_itself_is_refused_with_that_reason(tmp_path, status):
+    """A header is no row that is not good."""
+    lines = SPUN.splitlines()
+    if status:
+        lines = [
+            f"{line},{'status' if number == 0 else 'good'}" for number, line in enumerate(lines)
+        ]
+    with pytest.raises(BadFile, match=r"line 4: row: repeats the header"):
+        read("\n".join(lines * 2), tmp_path)
+
+
 def test_rates_of_a_row_tell_how_often_the_body_turned(tmp_path):
     """24 deg/s and ten seconds: the shorter way would be 120 degrees, the other way round."""
     known = read(SPUN, tmp_path)

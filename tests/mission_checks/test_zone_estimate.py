@@ -141,7 +141,7 @@ def test_no_random_axis_has_a_poorer_or_richer_zone_than_the_extremes(
 def test_the_command_says_where_the_sky_exceeds_the_bound(acquire):
     code, out, _ = acquire("mission", "estimate", "XTE", "--size", "10.66", "15", "--epoch", "2000")
     assert code == 0
-    assert "counted exceeds the bound: cap of 15 deg\n" in out + "\n"
+    assert "counted exceeds the bound: cap with a radius of 15 deg\n" in out + "\n"
 
 
 def test_the_command_estimates_each_size_and_limit(acquire, tmp_path):
@@ -157,7 +157,7 @@ def test_the_command_estimates_each_size_and_limit(acquire, tmp_path):
     assert [each["pairs"]["most"] for each in found[2:]] > [each["pairs"]["most"] for each in found]
     code, out, _ = acquire(*arguments)
     assert code == 0
-    assert "cap of 12 deg" in out
+    assert "cap with a radius of 12 deg" in out
 
 
 @pytest.mark.parametrize(
