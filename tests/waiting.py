@@ -1,7 +1,9 @@
-"""Waits for what another thread or process does, instead of sleeping for a guessed time."""
+"""Waits for what another thread or process does, and the processes that a process started."""
 
 import time
 from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
 from typing import TypeVar
 
 Value = TypeVar("Value")
@@ -26,3 +28,13 @@ def wait_until(
             raise AssertionError(f"waited {seconds:g} s: {message}")
         time.sleep(every_s)
     return value
+
+
+def children_of(pid: int) -> set[int]:
+    """The processes that a process has started, and those that these have."""
+    found: set[int] = set()
+    # A process may end while it is looked at.
+    with suppress(OSError):
+        for file in Path(f"/proc/{pid}/task").glob("*/children"):
+            found.update(map(int, file.read_text().split()))
+    return found.union(*map(children_of, found))

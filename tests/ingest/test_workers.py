@@ -34,7 +34,6 @@ from service.observations.schema import submission_from_json
 from service.settings import Settings
 from service.storage.sql.tables import batches
 from tests import waiting
-from tests.features.archive.partitions.processes import children_of
 from tests.fresh_databases import sqlite_at
 from tests.ingest.test_replays import finished
 from tests.ingest.worker_tasks import double, half_sent, settings_once_there, unreadable
@@ -205,13 +204,17 @@ def local_workers(sky):
 def test_workers_that_are_still_starting_are_ended_as_well(local_workers, tmp_path):
     never_read = tmp_path / "catalog.npz"
     os.mkfifo(never_read)
-    before = children_of(server_pid()) if server_pid() else set()
+    before = waiting.children_of(server_pid()) if server_pid() else set()
     workers = local_workers(double, catalog=never_read)
     workers.start()
-    started = wait_until(lambda: children_of(server_pid()) - before, why="no worker is started")
+    started = wait_until(
+        lambda: waiting.children_of(server_pid()) - before, why="no worker is started"
+    )
     workers.close()
     assert not workers.pids
-    wait_until(lambda: not children_of(server_pid()) & started, why="a worker is left behind")
+    wait_until(
+        lambda: not waiting.children_of(server_pid()) & started, why="a worker is left behind"
+    )
 
 
 def assert_13_is_lost(futures, error=WorkerLost):
@@ -365,7 +368,7 @@ class Served:
             send(lines[0], "first")
             wait_until(is_up, why="no worker is ready")
             assert 'run="named",spacecraft="XTE"} 1.0' in client.get("/metrics").text
-            self.children = children_of(self.process.pid)
+            self.children = waiting.children_of(self.process.pid)
             send(b"\n".join(lines), "bulk")
             wait_until(
                 lambda: client.get("/api/v1/batches?run=bulk&limit=1").json()["items"],

@@ -7,7 +7,7 @@ import sys
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from tests.waiting import wait_until
+from tests.waiting import children_of, wait_until
 
 CHECKOUT = Path(__file__).parents[4]
 WAIT_S = 240.0
@@ -37,16 +37,6 @@ def end(process):
     process.kill()
     process.communicate()
     return was_there
-
-
-def children_of(pid):
-    """The processes that a process has started, and those that these have."""
-    found = set()
-    # A process may end while it is looked at.
-    with suppress(OSError):
-        for file in Path(f"/proc/{pid}/task").glob("*/children"):
-            found.update(map(int, file.read_text().split()))
-    return found.union(*map(children_of, found))
 
 
 def workers_of(pid):
