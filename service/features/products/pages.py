@@ -89,12 +89,13 @@ class GradeOfFile:
         """True if a file has several intervals, and more than a tenth as many as attitudes."""
         return self.stretches * FEW_PER_STRETCH > self.attitudes and self.stretches > 1
 
-    def ends_before(self, other: "GradeOfFile") -> bool:
-        """True if another grade has attitudes that are later by more than the largest gap."""
+    def falls_short_of(self, other: "GradeOfFile") -> bool:
+        """True if another grade reaches further in time, by more than the largest gap."""
         if self.covers is None or other.covers is None:
             return False
-        later_s = (other.covers[1].tai_ns - self.covers[1].tai_ns) / 1e9
-        return later_s > max(self.largest_gap_s, other.largest_gap_s)
+        (first, last), (others_first, others_last) = self.covers, other.covers
+        missing_ns = max(first.tai_ns - others_first.tai_ns, others_last.tai_ns - last.tai_ns)
+        return missing_ns * 1e-9 > max(self.largest_gap_s, other.largest_gap_s)
 
 
 @console_page("/spacecraft/{name}/files", "Files", Policy("read", "path"), section="/")
