@@ -56,9 +56,16 @@ def read_attitude_csv(name: str, file: IO[bytes]) -> KnownAttitudes:
     segments: list[Segment] = []
     rows: list[_Row] = []
     line = begun = 1
+    first: tuple[int, int, list[float]] | None = None
     for line, stretch, time_ns, numbers, rates in _rows(source, file):
+        first = first or (line, time_ns, numbers)
         if rows and time_ns <= rows[-1][0]:
-            raise source.bad(line, "time", "must be later than that of the row before")
+            message = "must be later than that of the row before"
+            if (time_ns, numbers) == (rows[-1][0], rows[-1][2]):
+                message = "repeats the row before it: a row must be there once"
+            elif (time_ns, numbers) == first[1:]:
+                message = f"repeats line {first[0]}: the file was appended to itself"
+            raise source.bad(line, "time", message)
         if rows and (stretch != rows[-1][1] or _is_gap(stretch, time_ns - rows[-1][0])):
             segments.append(_segment(begun, rows))
             rows = []

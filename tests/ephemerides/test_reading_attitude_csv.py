@@ -88,7 +88,20 @@ def rows_of(angles_deg, rate):
 def test_attitudes_that_stand_still_while_the_rates_turn_are_refused(tmp_path):
     with pytest.raises(BadFile, match="record 4: repeats the attitude before it"):
         read(rows_of([0.0, 5.0, 10.0, 10.0, 20.0, 25.0, 30.0], 0.5), tmp_path)
+    with pytest.raises(BadFile, match="record 2: repeats the attitude before it"):
+        read(rows_of([30.0] * 7, 0.5), tmp_path)
     assert len(read(rows_of([30.0] * 7, 0.0), tmp_path)) == 7
+
+
+def test_rows_that_are_there_twice_are_refused_by_name(tmp_path):
+    text = rows_of(5.0 * np.arange(7), 0.5)
+    head, *body = text.splitlines()
+    with pytest.raises(BadFile, match="repeats line 2: the file was appended to itself"):
+        read("\n".join([text, *body]), tmp_path)
+    with pytest.raises(BadFile, match="line 4: time: repeats the row before it"):
+        read("\n".join([head, body[0], body[1], *body[1:]]), tmp_path)
+    with pytest.raises(BadFile, match="must be later than that of the row before"):
+        read("\n".join([text, body[3]]), tmp_path)
 
 
 def test_the_identity_is_an_attitude_where_the_rates_lead_there(tmp_path):

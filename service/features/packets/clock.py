@@ -1,14 +1,14 @@
 """Conversion of packet values to numbers, and of CCSDS times (CDS and CUC, 301.0-B-4) to UTC."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, date, datetime, timedelta
 from functools import lru_cache
 from typing import Any
 
 from service.errors import BadInput
-from service.features.packets.definition import PacketFault
+from service.features.packets.definition import PacketFault, ParameterKind
 from service.missions.packets import CdsTime, CucTime, PacketTime
 from service.times import DAY_S, FIRST_YEAR, LAST_YEAR, parse_utc, recorded_utc
 
@@ -38,6 +38,62 @@ def names_of(time: PacketTime) -> tuple[str, ...]:
     if isinstance(time, CdsTime):
         return tuple(filter(None, (time.day, time.millisecond, time.microsecond)))
     return tuple(filter(None, (time.coarse, time.fine)))
+
+
+_EPOCHS = {
+    "TAI": (datetime(1958, 1, 1), "tai"),
+    "GPS": (datetime(1980, 1, 6), "gps"),
+    "UNIX": (datetime(1970, 1, 1), "utc"),
+    "POSIX": (datetime(1970, 1, 1), "utc"),
+    "J2000": (datetime(2000, 1, 1, 12), ""),
+}
+"""Named epochs of XTCE, with the clock that counts from there; J2000 names no clock."""
+_EPOCH_S = 70.0
+"""Largest difference in seconds between the clocks of one epoch (UTC and TT at J2000: 64.2 s)."""
+_UNITS = {"s": 1.0, "sec": 1.0, "second": 1.0, "d": 86400.0, "day": 86400.0, "min": 60.0}
+_UNITS |= {"ms": 1e-3, "msec": 1e-3, "millisecond": 1e-3, "ns": 1e-9, "nanosecond": 1e-9}
+_UNITS |= {"us": 1e-6, "usec": 1e-6, "microsecond": 1e-6, "minute": 60.0, "hour": 3600.0}
+"""Seconds of a unit of time; units in the plural have an s after it."""
+
+
+def misfits(time: PacketTime, kinds: Mapping[str, ParameterKind]) -> Iterator[tuple[str, str]]:
+    """Parameters whose XTCE type contradicts a time of the mission file, each with the reason."""
+    if isinstance(time, CdsTime):
+        units = {time.day: 86400.0, time.millisecond: 1e-3, time.microsecond or "": 1e-6}
+    else:
+        units = {time.coarse: 1.0, time.fine or "": 0.0}
+    for name, needed_s in units.items():
+        if (kind := kinds.get(name)) is None:
+            continue
+        word = kind.unit.lower()
+        unit_s = _UNITS.get(word) or _UNITS.get(word.removesuffix("s"))
+        if kind.time_scale != 1.0:
+            yield name, f"has the scale {kind.time_scale:g} in the XTCE file; a count is needed"
+        elif unit_s is not None and unit_s != (needed_s or 1.0):
+            needed = f"{needed_s:g} s" if needed_s else "2^-fine_bits s"
+            yield name, f"is in {kind.unit} by the XTCE file; units of {needed} are needed"
+    first = names_of(time)[0]
+    if first in kinds and (counted := kinds[first].time_epoch) and _is_other_epoch(time, counted):
+        clock = "" if isinstance(time, CdsTime) else f" on the clock {time.scale}"
+        message = f"counts from {counted} by the XTCE file, from {time.epoch.isoformat()}{clock}"
+        yield first, f"{message} by the mission file: make them agree"
+
+
+def _is_other_epoch(time: PacketTime, counted: str) -> bool:
+    """True if an epoch of XTCE is not that of a time; False for one that cannot be read."""
+    try:
+        epoch, scale = _EPOCHS.get(counted.upper()) or (datetime.fromisoformat(counted), "")
+    except ValueError:
+        return False
+    if isinstance(time, CdsTime):
+        return epoch.date() != time.epoch
+    if scale:
+        behind_tai_s = {"gps": -GPS_LESS_TAI_S}
+        if (scale == "utc") != (time.scale == "utc"):
+            return True
+        apart_s = behind_tai_s.get(time.scale, 0) - behind_tai_s.get(scale, 0)
+        return time.epoch + timedelta(seconds=apart_s) != epoch
+    return abs((epoch.replace(tzinfo=None) - time.epoch).total_seconds()) > _EPOCH_S
 
 
 @dataclass(frozen=True, slots=True)

@@ -364,6 +364,12 @@ class ParameterKind:
 
     kind: Literal["number", "boolean", "enumerated", "text", "binary"]
     labels: Mapping[str, float | None] = field(default_factory=dict)
+    unit: str = ""
+    """Unit of the calibrated value as the XTCE file names it, such as `seconds`."""
+    time_epoch: str = ""
+    """Epoch of an absolute time as the XTCE file names it, such as `GPS` or `1958-01-01`."""
+    time_scale: float = 1.0
+    """Factor by which the XTCE file multiplies the count of a time."""
 
 
 class PacketDefinition:
@@ -506,7 +512,15 @@ def _kind_of(
         return ParameterKind("boolean", named_booleans.get(parameter_type.name, {}))
     if encoding == "StringDataEncoding":
         return ParameterKind("text")
-    return ParameterKind("binary" if encoding == "BinaryDataEncoding" else "number")
+    if encoding == "BinaryDataEncoding":
+        return ParameterKind("binary")
+    unit = (parameter_type.unit or "").strip()
+    if name not in ("AbsoluteTime", "RelativeTime"):
+        return ParameterKind("number", unit=unit)
+    calibrator = parameter_type.encoding.default_calibrator
+    factors = [each.coefficient for each in getattr(calibrator, "coefficients", ())]
+    scale = next((float(each) for each in factors if not float(each).is_integer()), 1.0)
+    return ParameterKind("number", {}, unit, (parameter_type.epoch or "").strip(), scale)
 
 
 def _fits(container: Any, values: Any) -> bool:

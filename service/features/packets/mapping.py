@@ -7,13 +7,14 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from service.errors import BadInput, Fault, shown_value
-from service.features.packets.clock import names_of
+from service.features.packets.clock import misfits, names_of
 from service.features.packets.definition import PacketDefinition, ParameterKind
 from service.missions.mission import Mission
 from service.missions.packets import (
     PacketGyroBlocks,
     PacketMeasurement,
     Packets,
+    PacketTime,
     PacketTracker,
     element_names,
 )
@@ -100,6 +101,9 @@ def packet_map(table: Packets, definition: PacketDefinition) -> PacketMap:
             message = _missing(name, definition) if kind is None else _misfit(key, kind, labels)
             if message:
                 faults.append(Fault(f"packets.{key}", message, shown_value(name)))
+    for key, time in _times(found):
+        for name, message in misfits(time, definition.parameters):
+            faults.append(Fault(f"packets.{key}", message, shown_value(name)))
     if faults:
         raise BadInput(faults[:20])
     return _with_digits(found, definition)
@@ -256,10 +260,24 @@ def _measurement(table: PacketMeasurement) -> MeasurementColumns:
     )
 
 
+def _times(found: PacketMap) -> Iterable[tuple[str, PacketTime]]:
+    """All times of the packet table with their keys."""
+    table = found.table
+    yield "time", table.time
+    for index, columns in enumerate(found.measurements):
+        if columns.table.time:
+            yield f"measurements.{index}.time", columns.table.time
+    if table.prior is not None and table.prior.time is not None:
+        yield "prior.time", table.prior.time
+    if table.gyro_blocks is not None and table.gyro_blocks.time:
+        yield "gyro_blocks.time", table.gyro_blocks.time
+
+
 def _keys(found: PacketMap) -> Iterable[tuple[str, Iterable[str]]]:
     """All keys of the packet table with their parameter names."""
     table = found.table
-    yield "time", names_of(table.time)
+    for key, time in _times(found):
+        yield key, names_of(time)
     yield "batch", (table.batch,) if table.batch else ()
     for index, each in enumerate(found.trackers):
         at = f"trackers.{index}"
@@ -274,9 +292,6 @@ def _keys(found: PacketMap) -> Iterable[tuple[str, Iterable[str]]]:
         for word in ("quaternion", "sigma", "covariance"):
             yield f"{at}.{word}", getattr(columns, word)
         yield f"{at}.valid", (columns.table.valid,) if columns.table.valid else ()
-        yield f"{at}.time", names_of(columns.table.time) if columns.table.time else ()
-    if table.prior is not None and table.prior.time is not None:
-        yield "prior.time", names_of(table.prior.time)
     yield "prior.quaternion", found.quaternion
     yield "rates.components", found.rates
     yield "gyro.counts", found.gyro
@@ -284,7 +299,6 @@ def _keys(found: PacketMap) -> Iterable[tuple[str, Iterable[str]]]:
         for axis, names in enumerate(found.gyro_values):
             yield f"gyro_blocks.values.{axis}", names
         yield "gyro_blocks.time_offset_s", found.gyro_offsets
-        yield "gyro_blocks.time", names_of(blocks.time) if blocks.time else ()
         yield "gyro_blocks.count", (blocks.count,) if blocks.count else ()
     yield "velocity.components", found.velocity
     yield "position.components", found.position

@@ -187,3 +187,73 @@ def test_a_number_is_needed_in_every_other_place(key, kind):
     with pytest.raises(BadInput) as refusal:
         PacketReader(mission_with(TABLE.format(directions=VECTORS)), definition)
     assert f"packets.{key}: {KINDS[kind]}" in str(refusal.value)
+
+
+def timed(encoding, epoch, table, parameter="MS"):
+    """Reader of packets whose parameter is an absolute time of XTCE."""
+    kind = "U16" if parameter == "DAY" else "U32"
+    bits = kind[1:]
+    described = XTCE.replace(
+        f'"{parameter}" parameterTypeRef="{kind}"', f'"{parameter}" parameterTypeRef="T_T"'
+    ).replace(
+        "</ParameterTypeSet>",
+        f'<AbsoluteTimeParameterType name="T_T"><Encoding {encoding}><IntegerDataEncoding '
+        f'sizeInBits="{bits}" encoding="unsigned"/></Encoding><ReferenceTime><Epoch>{epoch}</Epoch>'
+        "</ReferenceTime></AbsoluteTimeParameterType></ParameterTypeSet>",
+    )
+    start = TABLE_OF_FLAG.index('kind = "cds"')
+    end = TABLE_OF_FLAG.index("[[packets.measurements]]")
+    definition = PacketDefinition(described.encode(), "enum.xml", "CCSDSPacket")
+    own = TABLE_OF_FLAG[:start] + table + "\n" + TABLE_OF_FLAG[end:]
+    return PacketReader(mission_with(own), definition)
+
+
+CUC = 'kind = "cuc"\ncoarse = "MS"\nscale = "tai"\nepoch = 1958-01-01T00:00:00'
+GPS = 'kind = "cuc"\ncoarse = "MS"\nscale = "gps"\nepoch = 1980-01-06T00:00:00'
+DAYS = 'kind = "cds"\nday = "DAY"\nmillisecond = "MS"'
+
+
+@pytest.mark.parametrize(
+    ("encoding", "epoch", "table", "words"),
+    [
+        (
+            'units="seconds"',
+            "GPS",
+            CUC,
+            "counts from GPS by the XTCE file, from 1958-01-01T00:00:00",
+        ),
+        ("", "TAI", GPS, "counts from TAI by the XTCE file"),
+        ("", "UNIX", CUC, "counts from UNIX by the XTCE file"),
+        ("", "GPS", GPS.replace('"gps"', '"tai"'), "counts from GPS .* on the clock tai"),
+        ("", "GPS", GPS.replace('"gps"', '"utc"'), "counts from GPS .* on the clock utc"),
+        ("", "2000-01-01T12:00:00", CUC, "counts from 2000-01-01T12:00:00"),
+        ('units="milliseconds"', "TAI", CUC, "is in milliseconds by the XTCE file; units of 1 s"),
+        ('units="seconds" scale="0.001"', "TAI", CUC, "has the scale 0.001 in the XTCE file"),
+        ('units="seconds"', "1958-01-01", DAYS, "is in seconds by the XTCE file; units of 0.001 s"),
+    ],
+)
+def test_a_time_that_the_xtce_file_counts_otherwise_is_refused(encoding, epoch, table, words):
+    with pytest.raises(BadInput, match=f"packets.time: {words}"):
+        timed(encoding, epoch, table)
+
+
+def test_a_day_of_another_epoch_is_refused():
+    with pytest.raises(BadInput, match=r"packets.time: counts from 2000-01-01 by the XTCE file"):
+        timed('units="days"', "2000-01-01", DAYS, "DAY")
+    timed('units="days"', "1958-01-01", DAYS, "DAY")
+
+
+@pytest.mark.parametrize(
+    ("encoding", "epoch", "table"),
+    [
+        ('units="seconds"', "TAI", CUC),
+        ("", "GPS", GPS),
+        ("", "GPS", CUC.replace("1958-01-01T00:00:00", "1980-01-06T00:00:19")),
+        ('scale="1"', "1980-01-06T00:00:00Z", GPS),
+        ("", "J2000", GPS.replace("1980-01-06T00:00:00", "2000-01-01T12:00:00")),
+        ("", "UNIX", GPS.replace("1980-01-06", "1970-01-01").replace('"gps"', '"utc"')),
+        ("", "launch", CUC),
+    ],
+)
+def test_a_time_that_the_xtce_file_counts_alike_is_read(encoding, epoch, table):
+    timed(encoding, epoch, table)
