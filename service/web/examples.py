@@ -293,14 +293,37 @@ def packages() -> dict[str, str]:
     }
 
 
-def write(found: Json) -> None:
-    """Write the examples of operations to the folders of their routes."""
+def keep_recorded(walked: Any, again: Any, recorded: Any) -> Any:
+    """Return an answer with the recorded values where two walks differ, as in ids and times."""
+    if isinstance(walked, dict) and isinstance(recorded, dict):
+        # Two durations in microseconds may be equal by chance.
+        others = again if isinstance(again, dict) else {}
+        others = {name: value for name, value in others.items() if not name.endswith("_us")}
+        return {
+            name: keep_recorded(value, others.get(name), recorded[name])
+            if name in recorded
+            else value
+            for name, value in walked.items()
+        }
+    lists = [each for each in (walked, again, recorded) if isinstance(each, list)]
+    if len(lists) == 3 and len({len(each) for each in lists}) == 1:
+        return [keep_recorded(*each) for each in zip(*lists, strict=True)]
+    return recorded if walked != again and type(walked) is type(recorded) else walked
+
+
+def write(walked: Json, again: Json) -> None:
+    """Write the examples of operations to the folders of their routes.
+
+    What two walks answer alike is written; elsewhere the files keep what they hold.
+    """
     own = packages()
     parts: dict[str, Json] = defaultdict(dict)
-    for operation, known in found.items():
+    for operation, known in walked.items():
         parts[own.get(operation, "service.web")][operation] = known
     for package, part in parts.items():
         file = Path(str(files(package)), EXAMPLES)
+        recorded = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
+        part = keep_recorded(part, {name: again[name] for name in part}, recorded)
         text = json.dumps(part, indent=1, ensure_ascii=False) + "\n"
         file.write_text(text, encoding="utf-8")
 
@@ -308,4 +331,4 @@ def write(found: Json) -> None:
 if __name__ == "__main__":
     # With `--help` the parser ends the program before it writes the file.
     argparse.ArgumentParser(prog="python -m service.web.examples", description=__doc__).parse_args()
-    write(fresh_walk())
+    write(fresh_walk(), fresh_walk())

@@ -13,7 +13,7 @@ from service.observations.schema import submission_from_json
 from service.storage.recording.events import EVENT_KINDS
 from service.storage.sql.tables import events
 from service.web.app import bare_app, openapi_yaml
-from service.web.examples import fresh_walk
+from service.web.examples import fresh_walk, keep_recorded
 from service.web.openapi import examples
 from tests.web.conformance import FILE, reference, validator
 
@@ -173,6 +173,14 @@ def test_the_examples_are_what_the_app_still_answers():
     """Numbers that differ from run to run aside."""
     found = fresh_walk()
     assert shape(found) == shape(examples()), "run: python -m service.web.examples && make openapi"
+
+
+def test_new_examples_keep_ids_times_and_durations():
+    recorded = {"id": "a", "stars": 3, "many": [{"at": 1}], "timings_us": {"zone": 7}}
+    walked = {"id": "b", "stars": 4, "many": [{"at": 2}], "timings_us": {"zone": 5}, "new": "n"}
+    again = {"id": "c", "stars": 4, "many": [{"at": 3}], "timings_us": {"zone": 5}, "new": "m"}
+    kept = keep_recorded(walked, again, recorded)
+    assert kept == recorded | {"stars": 4, "new": "n"}
 
 
 def shape(value):
