@@ -287,6 +287,22 @@ NO_TIMES = {
         {"DATE-OBS": NOON, "XPOSURE": (500, "in ms"), "TIMEUNIT": "s"},
         "its comment says otherwise",
     ),
+    "an exposure without a unit beside a unit of times": (
+        {"DATE-OBS": NOON, "EXPTIME": 500, "TIMEUNIT": "ms"},
+        "EXPTIME is 500 without a unit, and TIMEUNIT is ms",
+    ),
+    "an exposure with pauses": (
+        {"DATE-OBS": NOON, "XPOSURE": 5.0, "TELAPSE": 10.0, "TIMEUNIT": "s"},
+        "TELAPSE is 10 s, and the exposure is 5 s",
+    ),
+    "exposures that a camera added": (
+        {"DATE-OBS": NOON, "EXPTIME": 4.0, "COADDS": 10},
+        "it is a stack of 10 exposures (COADDS) without DATE-END",
+    ),
+    "another time of day at the start": (
+        {"DATE-OBS": NOON, "EXPTIME": 4.0, "UTSTART": "13:00:00.000"},
+        "and UTSTART 13:00:00.000",
+    ),
     "a unit in a card and another one in the comment": (
         {"DATE-OBS": NOON, "EXPTIME": (500, "[s]"), "EXPUNIT": "ms"},
         "EXPTIME is 500 ms, and its comment says otherwise",

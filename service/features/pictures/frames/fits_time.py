@@ -19,6 +19,8 @@ from service.times import DAY_S, TT_LESS_TAI_S, Utc, parse_utc, recorded_utc, sh
 EXPOSURES = ("XPOSURE", "EXPTIME", "EXPOSURE")
 EXPOSURE_UNITS = ("EXPUNIT", "EXPUNITS", "EXP_UNIT", "EXPTUNIT")
 """FITS keywords of the unit of exposures, outside the standard."""
+OF_TIMEUNIT = ("XPOSURE", "TELAPSE")
+"""FITS keywords of durations in the unit of TIMEUNIT (9.7)."""
 AVERAGES, STARTS, ENDS = (
     ("DATE-AVG", "MJD-AVG"),
     ("DATE-BEG", "DATE-OBS", "MJD-BEG", "MJD-OBS"),
@@ -29,6 +31,8 @@ OBSERVED = ("DATE-OBS", "MJD-OBS")
 """FITS keywords of dates whose comments may name the moment: start, middle or end (9.5)."""
 TIMES_OF_DAY = ("TIME-OBS", "UT")
 """FITS keywords of a time of day that completes a date without one."""
+START_CLOCKS = (*TIMES_OF_DAY, "UTSTART", "UTC-OBS", "UT-OBS", "UTSHUT", "UTOPEN")
+"""FITS keywords of a time of day that must agree with a whole date."""
 UTC_OFFSETS = ("UTCOFFS", "UTC-OFFS", "UTCOFF", "UTC-OFF", "UTCOFFSE", "UTC_OFFS")
 """FITS keywords of the hours by which a header's local time is ahead of UTC."""
 ZONES = (*UTC_OFFSETS, "TIMEZONE", "TZ")
@@ -38,7 +42,7 @@ JULIAN_DATES = ("JD", "JD-OBS", "JD_UTC", "MJD")
 """FITS keywords of a Julian date outside the standard, compared with the date alone."""
 JULIAN_SAME_S = 2.0
 """Error in seconds of a Julian date with five decimals."""
-STACKED = ("STACKCNT", "NCOMBINE", "SNAPSHOT")
+STACKED = ("STACKCNT", "NCOMBINE", "SNAPSHOT", "COADDS", "NCOADDS", "NCOADD", "NDIT")
 """FITS keywords of the number of exposures that were combined to a picture."""
 LONGEST_EXPOSURE_S = 3600.0
 SAME_S = 1.0
@@ -208,7 +212,7 @@ def _seconds(header: Header, key: str) -> tuple[float, str]:
         number, unit = repr(value), ""
     else:
         raise ValueError(f"{key} is no number")
-    cards = (*EXPOSURE_UNITS, *(("TIMEUNIT",) if key == "XPOSURE" else ()))
+    cards = (*EXPOSURE_UNITS, *(("TIMEUNIT",) if key in OF_TIMEUNIT else ()))
     common = [str(header.cards[each]).strip() for each in cards if header.cards.get(each)]
     own = [_scale_of_unit(each, key) for each in (unit, *common) if each]
     stated = _stated_scales(comment, key)
@@ -217,6 +221,9 @@ def _seconds(header: Header, key: str) -> tuple[float, str]:
         raise _Contradictory(f"{key} is {shown}: units that contradict each other")
     if len(stated) > 1 or (own and stated and own[0] not in stated):
         raise _Contradictory(f"{key} is {shown}, and its comment says otherwise: {comment[:60]}")
+    time_unit = str(header.cards.get("TIMEUNIT") or "s").strip()
+    if not own and not stated and _UNITS_S.get(time_unit.lower(), 1.0) != 1.0:
+        raise _Contradictory(f"{key} is {shown} without a unit, and TIMEUNIT is {time_unit[:20]}")
     scale = own[0] if own else next(iter(stated), 1.0)
     seconds = float(number) * scale
     if not own and stated and scale != 1.0:
@@ -313,7 +320,7 @@ class _DateCards:
             return
         scale = self._scale("DATE-OBS")
         start = _read(date.strip(), None, scale)
-        for key in TIMES_OF_DAY:
+        for key in START_CLOCKS:
             clock, comment = cards.get(key), self.header.comments.get(key, "")
             said_otherwise = _LOCAL.search(comment) or _OTHER_MOMENTS.search(comment.lower())
             if not isinstance(clock, str) or said_otherwise:
@@ -353,6 +360,15 @@ class _DateCards:
             count = self.header.cards.get(key)
             if isinstance(count, (int, float)) and count > 1:
                 raise _NoTime(f"it is a stack of {count:g} exposures ({key}) without DATE-END")
+        exposure_s = self.exposure.seconds
+        if lasted_s is not None or exposure_s is None or self.header.cards.get("TELAPSE") is None:
+            return
+        try:
+            elapsed_s, _ = _seconds(self.header, "TELAPSE")
+        except (ValueError, _Contradictory):
+            return
+        if abs(elapsed_s - exposure_s) > 2 * SAME_S:
+            raise _NoTime(f"TELAPSE is {elapsed_s:g} s, and the exposure is {exposure_s:g} s")
 
     def _missing(self, moment: Utc | None) -> str:
         problems = "".join(f"; {each}" for each in (*self.problems, self.exposure.problem) if each)
