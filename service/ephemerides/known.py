@@ -8,6 +8,7 @@ from itertools import pairwise
 from typing import Literal, Protocol, Self, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 
 from service.ephemerides.rows import SAME_MOMENT_NS, Integers
 from service.errors import BadFile, Fault
@@ -27,7 +28,11 @@ FILL_RAD = 0.05
 """Least jump in radians to the identity that marks it as a fill value."""
 STILL_RAD = 1e-5
 """Rotation in radians between records above which rates of zero count as missing."""
+Flags = npt.NDArray[np.bool_]
 MISSED_RAD, MISSED_SHARE = math.radians(0.05), 0.5
+HELD_RAD, HELD_RAD_S = math.radians(0.5), math.radians(0.01)
+"""Least turn and rate of a body whose repeated attitude was not measured anew: more than the
+rounding of three decimals, and more than the bias of a gyro."""
 """Least difference, in radians and as a share, of a step from its rates that contradicts them."""
 MEANT_SHARE = 0.1
 """Largest share of that difference that is left where rates are meant in another sign or unit."""
@@ -185,6 +190,18 @@ def _carried(q: Vector, rates_rad_s: Vector, passed_ns: int) -> Vector:
     return np.asarray(turned_quaternion(q[None], turn[None])[0])
 
 
+def _is_held(repeats: Flags, expected: Vector, step_s: Vector) -> Flags:
+    """Steps of one repeated attitude from whose first to last the rates turn the body far.
+
+    At ten records a second each step is a small one.
+    """
+    runs = np.cumsum(~repeats)
+    turns = [np.bincount(runs, np.where(repeats, axis, 0.0)) for axis in expected.T]
+    total_rad = np.linalg.norm(turns, axis=0)
+    passed_s = np.bincount(runs, np.where(repeats, step_s[:, 0], 0.0))
+    return np.asarray(((total_rad > HELD_RAD) & (total_rad > HELD_RAD_S * passed_s))[runs])
+
+
 def _require_own_rates(file: str, segment: Segment) -> None:
     """Raise `BadFile` for rates that fit the attitudes in another sign or unit only.
 
@@ -202,7 +219,8 @@ def _require_own_rates(file: str, segment: Segment) -> None:
     )
     larger = np.maximum(by_steps, by_rates)
     near = larger <= QUARTER_TURN_RAD
-    stands = near & (q[1:] == q[:-1]).all(axis=1) & (by_rates > MISSED_RAD)
+    repeats = near & (q[1:] == q[:-1]).all(axis=1)
+    stands = repeats & ((by_rates > MISSED_RAD) | _is_held(repeats, expected, step_s))
     if stands.any():
         record = int(np.flatnonzero(stands)[0]) + 2
         message = "repeats the attitude before it, from which its rates turn the body"

@@ -93,6 +93,25 @@ def test_attitudes_that_stand_still_while_the_rates_turn_are_refused(tmp_path):
     assert len(read(rows_of([30.0] * 7, 0.0), tmp_path)) == 7
 
 
+def test_a_frozen_attitude_is_found_over_small_steps_and_a_biased_gyro_is_not_one(tmp_path):
+    """At ten records a second and 0.4 deg/s no step is large; a bias of 0.005 deg/s adds up."""
+
+    def rows_at(angles_deg, rate, step_s):
+        cells = (
+            f"1996-01-10T12:{int(k * step_s) // 60:02d}:{k * step_s % 60:06.3f}Z,"
+            + ",".join(map(repr, (*about_z(angle).tolist(), 0.0, 0.0, float(rate))))
+            for k, angle in enumerate(angles_deg)
+        )
+        return "\n".join([ROWS.splitlines()[0], *cells])
+
+    turning = 0.04 * np.arange(600)
+    assert len(read(rows_at(turning, 0.4, 0.1), tmp_path)) == 600
+    frozen = np.where(turning < 8.0, turning, 8.0)
+    with pytest.raises(BadFile, match="record 202: repeats the attitude before it"):
+        read(rows_at(frozen, 0.4, 0.1), tmp_path)
+    assert len(read(rows_at([30.0] * 600, 0.005, 1.0), tmp_path)) == 600
+
+
 def test_rows_that_are_there_twice_are_refused_by_name(tmp_path):
     text = rows_of(5.0 * np.arange(7), 0.5)
     head, *body = text.splitlines()

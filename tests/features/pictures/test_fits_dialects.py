@@ -114,6 +114,16 @@ TIMES = {
     "TT": ({"DATE-AVG": "2026-03-01T12:01:09.184", "TIMESYS": "TT"}, {}, 0.0),
     "TT(BIPM)": ({"DATE-AVG": "2026-03-01T12:01:09.184", "TIMESYS": "TT(BIPM08)"}, {}, 0.0),
     "GPS": ({"DATE-AVG": "2026-03-01T12:00:18", "TIMESYS": "GPS"}, {}, 0.0),
+    "an elapsed time in seconds beside milliseconds": (
+        {"DATE-OBS": NOON, "EXPTIME": 4000, "EXPUNIT": "ms", "TELAPSE": 4.0},
+        {},
+        2.0,
+    ),
+    "an elapsed time that is not given": (
+        {"DATE-OBS": NOON, "EXPTIME": 4.0, "TELAPSE": 0},
+        {},
+        2.0,
+    ),
     "milliseconds in a card of the unit": (
         {"DATE-OBS": NOON, "EXPTIME": 4000, "EXPUNIT": "ms"},
         {},

@@ -212,7 +212,8 @@ def _seconds(header: Header, key: str) -> tuple[float, str]:
         number, unit = repr(value), ""
     else:
         raise ValueError(f"{key} is no number")
-    cards = (*EXPOSURE_UNITS, *(("TIMEUNIT",) if key in OF_TIMEUNIT else ()))
+    cards: tuple[str, ...] = EXPOSURE_UNITS if key in EXPOSURES else ()
+    cards += ("TIMEUNIT",) if key in OF_TIMEUNIT else ()
     common = [str(header.cards[each]).strip() for each in cards if header.cards.get(each)]
     own = [_scale_of_unit(each, key) for each in (unit, *common) if each]
     stated = _stated_scales(comment, key)
@@ -367,7 +368,8 @@ class _DateCards:
             elapsed_s, _ = _seconds(self.header, "TELAPSE")
         except (ValueError, _Contradictory):
             return
-        if abs(elapsed_s - exposure_s) > 2 * SAME_S:
+        # A value of zero is none.
+        if elapsed_s > 0.0 and abs(elapsed_s - exposure_s) > 2 * SAME_S:
             raise _NoTime(f"TELAPSE is {elapsed_s:g} s, and the exposure is {exposure_s:g} s")
 
     def _missing(self, moment: Utc | None) -> str:
