@@ -292,5 +292,15 @@ def test_a_score_counts_wrong_names_and_compares_errors_with_their_sigma():
     assert (found.within_percent, found.median_solving_us, found.median_whole_us) == (100, 5, 6)
 
 
+@pytest.mark.parametrize(
+    ("feature", "command"), [("definitive", "acquire smooth"), ("pictures", "acquire frame")]
+)
+def test_it_names_no_command_of_a_feature_that_is_off(tmp_path, feature, command):
+    for off, is_named in (("", True), (feature, False)):
+        settings = Settings(features_off=off)
+        rows = demonstration._where_next("http://127.0.0.1:8000", "r", tmp_path, settings, False)
+        assert any(row.startswith(command) for row, _ in rows) is is_named
+
+
 def test_a_pass_without_stars_has_a_table_all_the_same():
     assert "nan" in score_table({"XTE": {"nominal": Score()}})
