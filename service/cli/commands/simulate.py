@@ -53,7 +53,7 @@ def _add_telemetry(group: Any) -> None:
     parser.add_argument(
         "--start",
         metavar="UTC",
-        help="time of the first batch; default 1999-03-01, bands 1996-04-16",
+        help="time of the first batch; default 1999-03-01T00:00:00Z, bands 1996-04-16T00:00:00Z",
     )
     parser.add_argument(
         "--cadence", type=float, metavar="S", help="seconds between batches; default 30, bands 300"

@@ -315,8 +315,8 @@ def _a_priori(now: StarTable, before: StarTable | None) -> Iterator[Factor]:
     if not now.solved.all() and np.count_nonzero(beyond) > np.count_nonzero(now.solved) / 2:
         beyond |= ~now.solved
         evidence += (
-            " Batches without a good attitude have no such angle; they count here, since most of "
-            "the others are beyond the zone."
+            " Batches without a good attitude count here, too: their angle is not known, and most "
+            "of the others are beyond the zone."
         )
     yield Factor(beyond, beyond[now.batch], text, evidence, remedy)
 

@@ -9,10 +9,12 @@ from markupsafe import Markup, escape
 from pydantic import model_validator
 from starlette.responses import Response
 
+from service.errors import BadInput
 from service.features.advice.part import AdviceService, best_setting, no_changes_text
 from service.features.advice.routes import ADVICE_LIMIT_S, MAX_SAMPLE, AdviceQuery
 from service.features.advice.text import mission_lines
 from service.missions.mission import Tolerances
+from service.times import DAY_S, Utc, shifted
 from service.web.console.options import SYMBOLS
 from service.web.console.page import ContextDep, FromQuery, PageContext, Panel, console_page
 from service.web.console.pages.spacecraft_page import PeriodBefore, ShownPeriod
@@ -101,4 +103,18 @@ def ambiguity_of_period(
         yield Panel("_ambiguity.html.jinja", found)
 
 
-PANELS = {"ambiguity": ambiguity_of_period}
+def causes_of_alarm(
+    context: PageContext, name: str, run: str, start: Utc, end: Utc
+) -> Iterator[Panel]:
+    """Panel of the causes that explain the stars of an alarm's first day, if there are any."""
+    last = min(end, shifted(start, DAY_S), key=lambda each: each.tai_ns)
+    try:
+        found = context.app.part(AdviceService).ambiguity(name, run, start, last)
+    except BadInput:
+        # A recorded batch cannot be read any more: the page of the alarm does without.
+        return
+    if found.causes:
+        yield Panel("_causes_of_alarm.html.jinja", found.causes)
+
+
+PANELS = {"ambiguity": ambiguity_of_period, "alarm_page": causes_of_alarm}

@@ -17,13 +17,20 @@ from service.observations.schema import Key
 from service.storage.queries.fleet import present_rank
 from service.times import DAY_S, Utc, recorded_utc, shifted
 from service.trends.limits import LimitSettings, Severity
-from service.trends.quantities import limited_trackers, quantity_named, trend_names
+from service.trends.quantities import (
+    REJECTED,
+    SILENCE,
+    limited_trackers,
+    quantity_named,
+    trend_names,
+)
 from service.web.console.formatting import age, second_after, with_day_of_year
 from service.web.console.page import (
     ContextDep,
     FromQuery,
     PageContext,
     PageQuery,
+    Panel,
     SortedQuery,
     console_page,
 )
@@ -115,7 +122,7 @@ class AlarmGroup:
 
 @console_page("/alarms", "Alarms", Policy("read", "nothing"), position=20)
 def alarms_page(query: FromQuery[AlarmsQuery], context: ContextDep) -> Response:
-    """Console page with the alarms of a run, the latest violation first."""
+    """Console page with the alarms of a run, the worst now first."""
     query = query.model_copy(update={"spacecraft": context.listed(query.spacecraft)})
     found, next_cursor = _found(context, query)
     lines = _sorted(_lines(context, found), query)
@@ -237,6 +244,7 @@ def alarm_page(id: str, query: FromQuery[AlarmQuery], context: ContextDep) -> Re
         alarm=alarm,
         line=line,
         is_retired=is_retired,
+        found=_found_causes(context, alarm, start, end),
         cause=quantity_named(alarm.quantity).cause,
         related=_related(context, alarm),
         trend=trend,
@@ -245,6 +253,13 @@ def alarm_page(id: str, query: FromQuery[AlarmQuery], context: ContextDep) -> Re
         before="day" if end.tai_ns - start.tai_ns <= DAY_S * 1e9 else "week",
         of_tracker={"tracker": alarm.tracker} if _has_tracker(context, alarm) else {},
     )
+
+
+def _found_causes(context: PageContext, alarm: Alarm, start: Utc, end: Utc) -> list[Panel]:
+    """Panels of other features on the cause of an alarm about stars and their attitudes."""
+    if alarm.quantity in (SILENCE, REJECTED) or alarm.spacecraft not in context.app.context.known:
+        return []
+    return context.panels("alarm_page", alarm.spacecraft, alarm.run, start, end)
 
 
 def _has_tracker(context: PageContext, alarm: Alarm) -> bool:

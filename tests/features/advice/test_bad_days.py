@@ -19,7 +19,7 @@ def text_of(part):
 
 @pytest.fixture(scope="module")
 def pages(tmp_path_factory):
-    """Row of each spacecraft in the overview, the page to which its change leads, its advice."""
+    """Overview row of each spacecraft, the page of its change, its advice, and its alarm."""
     end = bucket_start(utc_now().bucket(HOUR_S), HOUR_S)
     with (
         two_days(tmp_path_factory.mktemp("days"), end, BATCHES) as address,
@@ -34,13 +34,15 @@ def pages(tmp_path_factory):
             page = client.get(link).raise_for_status().text
             best = re.search(r'href="(/advice/[^"]*)#best"', page)[1]
             advice = client.get(html.unescape(best)).raise_for_status().text
-            found[case.name] = row, page, advice
+            critical = re.search(r'href="(/alarms/[0-9A-Z]{26})"', row)
+            alarm = client.get(critical[1]).raise_for_status().text if critical else ""
+            found[case.name] = row, page, advice, alarm
         yield found
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_the_change_leads_to_its_cause_and_to_the_same_figures(pages, case):
-    row, page, _ = pages[case.name]
+    row, page, *_ = pages[case.name]
     title = re.search(r'before=day[^>]*title="([^"]*)"', row)[1]
     panel = text_of(re.search(r'<div id="why".*?</section>', page, re.DOTALL)[0])
     told = re.search(
@@ -61,6 +63,14 @@ def test_the_change_leads_to_its_cause_and_to_the_same_figures(pages, case):
         assert "As many ambiguous stars as before, within chance" in panel
         assert "≈" in row
         assert causes == []
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_the_page_of_an_alarm_names_the_cause_found_before_the_usual_one(pages, case):
+    text = text_of(pages[case.name][3])
+    assert ("Cause found in the records" in text) is bool(case.cause)
+    if case.cause:
+        assert case.cause in text.partition("Otherwise the usual cause")[0], text
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
