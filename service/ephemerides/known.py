@@ -24,16 +24,16 @@ CLOCK_NS = 200
 DISCRETE_NS = 1_000_000
 """Nanoseconds about a record of a discrete segment for which its attitude holds."""
 
+Flags = npt.NDArray[np.bool_]
 FILL_RAD = 0.05
 """Least jump in radians to the identity that marks it as a fill value."""
 STILL_RAD = 1e-5
 """Rotation in radians between records above which rates of zero count as missing."""
-Flags = npt.NDArray[np.bool_]
 MISSED_RAD, MISSED_SHARE = math.radians(0.05), 0.5
+"""Least difference, in radians and as a share, of a step from its rates that contradicts them."""
 HELD_RAD, HELD_RAD_S = math.radians(0.5), math.radians(0.01)
 """Least turn and rate of a body whose repeated attitude was not measured anew: more than the
 rounding of three decimals, and more than the bias of a gyro."""
-"""Least difference, in radians and as a share, of a step from its rates that contradicts them."""
 MEANT_SHARE = 0.1
 """Largest share of that difference that is left where rates are meant in another sign or unit."""
 FEWEST_STEPS = 3
