@@ -111,6 +111,14 @@ def test_of_equal_alarms_the_one_far_beyond_its_limit_stands_before_a_newer_one(
     assert [each.tracker for each in item.alarms][:2] == ["STARTRACKER_1", "STARTRACKER_2"]
 
 
+def test_the_overview_of_a_run_without_limits_says_that_its_alarms_are_off(client, full_run):
+    for is_on in (True, False):
+        client.put(f"/api/v1/runs/{full_run}", json={"alarms": is_on}).raise_for_status()
+        text = text_of(client.get("/", params={"run": full_run}))
+        assert ("limits are not evaluated: alarms of this run are off" in text) is not is_on
+        assert ("alarms out of limits:" in text) is is_on
+
+
 def test_the_list_of_alarms_begins_with_the_worst_now(small_fleet):
     app, client = small_fleet
     page = client.get("/alarms").raise_for_status().text

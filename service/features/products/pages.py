@@ -31,6 +31,8 @@ GRADES: dict[ProductGrade, str] = {
 }
 MOST_COUNTED = 5_000
 """Greatest number of attitudes read to count intervals; takes about 0.1 s."""
+CONVERGED_S = 900.0
+"""Time in seconds that a filter may take until its attitude is good."""
 FEW_PER_STRETCH = 10
 """Least mean number of attitudes per interval for a file that is useful for interpolation."""
 
@@ -90,12 +92,14 @@ class GradeOfFile:
         return self.stretches * FEW_PER_STRETCH > self.attitudes and self.stretches > 1
 
     def falls_short_of(self, other: "GradeOfFile") -> bool:
-        """True if another grade reaches further in time, by more than the largest gap."""
+        """True if another grade reaches further in time, by more than gaps and convergence."""
         if self.covers is None or other.covers is None:
             return False
         (first, last), (others_first, others_last) = self.covers, other.covers
+        # A filter takes minutes until its first attitude is good.
+        least_s = max(CONVERGED_S, self.largest_gap_s, other.largest_gap_s)
         missing_ns = max(first.tai_ns - others_first.tai_ns, others_last.tai_ns - last.tai_ns)
-        return missing_ns * 1e-9 > max(self.largest_gap_s, other.largest_gap_s)
+        return missing_ns * 1e-9 > least_s
 
 
 @console_page("/spacecraft/{name}/files", "Files", Policy("read", "path"), section="/")

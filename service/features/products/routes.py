@@ -18,6 +18,7 @@ from service.features.products.moment import AtMethod
 from service.features.products.part import Products, TableKind
 from service.missions.product_settings import MAX_LARGEST_GAP_S, MIN_NAIF_ID, OBJECT_ID
 from service.table_files.formats import JSON_FORMAT, TABLE_FORMATS, write_table
+from service.times import shifted
 from service.trends.quantities import OneOf
 from service.web.openapi import FORMATS_OF, ApiRouter, Example, Returns
 from service.web.requests import query_parameters as params
@@ -124,6 +125,13 @@ class TableQuery(params.PeriodQuery):
     ] = "csv"
 
 
+def _days_of(query: params.PeriodQuery) -> str:
+    """Text for the name of a file: the first and the last UTC day of its period, or the one day."""
+    last = query.end and shifted(query.end, -1e-3)
+    days = dict.fromkeys(each.text[:10] for each in (query.start, last) if each)
+    return "".join(f"-{day}" for day in days)
+
+
 @Example("one", path={"name": "SWAS"})
 @router.serves(
     "GET /spacecraft/{name}/attitude",
@@ -152,7 +160,7 @@ def get_attitude(
         written.media_type,
         None
         if format == JSON_FORMAT
-        else attached_as(f"{name}-{query.run}-{kind}", file_suffix(format)),
+        else attached_as(f"{name}-{query.run}-{kind}{_days_of(query)}", file_suffix(format)),
     )
 
 
@@ -204,5 +212,5 @@ def get_table(
         caller,
         lambda: write_table(query.format, table),
         written.media_type,
-        attached_as(f"{name}-{query.run}-{kind}", query.format),
+        attached_as(f"{name}-{query.run}-{kind}{_days_of(query)}", query.format),
     )

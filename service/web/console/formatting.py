@@ -11,7 +11,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from service.times import HOUR_S, Utc, recorded_utc, shifted, utc_now
+from service.times import Utc, recorded_utc, shifted, utc_now
 from service.trends.measures import SmoothedShare
 from service.trends.quantities import Quantity, quantity_named
 
@@ -87,9 +87,9 @@ def completed_utc(text: str, near: Utc | None = None) -> str:
             days = int(ordinal) if ordinal else 30.6 * (int(month) - 1) + int(day)
             year = str(int(near.text[:4]) + round((near.day_of_year - days) / 366))
         else:
-            # The day on which the time of day is nearest.
-            nearest = shifted(near, 12 * HOUR_S - 1 - 60.0 * (60 * int(hour) + int(minute)))
-            year, month, day = nearest.text[:10].split("-")
+            # The last day on which this time of day is not after the given one, but for a minute.
+            last = shifted(near, 60.0 - 60.0 * (60 * int(hour) + int(minute)))
+            year, month, day = last.text[:10].split("-")
     date = f"{year}-{ordinal}" if ordinal else f"{year}-{month:0>2}-{day:0>2}"
     zone = zone if zone[:1] in ("+", "-") else "Z"
     return f"{date}T{hour or '00':0>2}:{minute or '00'}:{second or '00'}{zone}"

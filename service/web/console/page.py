@@ -129,6 +129,8 @@ class RunChoice:
 
     name: str
     batches: int | None
+    has_alarms: bool = True
+    """True if its batches can raise alarms."""
 
 
 @dataclass(frozen=True)
@@ -198,6 +200,11 @@ class Layout:
         return self.run == LIVE
 
     @property
+    def has_alarms(self) -> bool:
+        """True if batches of the shown run can raise alarms."""
+        return all(run.has_alarms for run in self.runs if run.name == self.run)
+
+    @property
     def navigation(self) -> list[ConsolePage]:
         """Pages of the navigation, in its order."""
         return navigation()
@@ -256,13 +263,17 @@ class PageContext:
         return [panel for make in makers if make is not None for panel in make(self, *shown)]
 
     def _layout(self, run: str) -> Layout:
-        batches = {each.run: each.batches for each in self.app.runs.all(self.caller.spacecraft)}
+        def choice(name: str) -> RunChoice:
+            row = known.get(name)
+            return RunChoice(name, row.batches, row.alarms) if row else RunChoice(name, None)
+
+        known = {each.run: each for each in self.app.runs.all(self.caller.spacecraft)}
         active = self.app.spacecraft.alarms(run)
         alarms = alarm_counts([each for each in active if self.caller.may_see(each.spacecraft)])
-        names = sorted({LIVE, run, *batches}, key=lambda name: (name != LIVE, name))
+        names = sorted({LIVE, run, *known}, key=lambda name: (name != LIVE, name))
         return Layout(
             run=run,
-            runs=tuple(RunChoice(name, batches.get(name)) for name in names),
+            runs=tuple(map(choice, names)),
             title=self.page.title,
             section=self.page.section,
             now=present(),

@@ -81,6 +81,20 @@ def test_each_format_is_a_file_of_its_type(name, client, full_run):
     assert len(answer.content) > 500
 
 
+@pytest.mark.parametrize(
+    ("end", "days"),
+    [("1999-03-02T00:00:00Z", "1999-03-01"), ("1999-03-02T00:00:01Z", "1999-03-01-1999-03-02")],
+)
+def test_the_name_of_a_file_has_its_days_and_its_grade(client, full_run, end, days):
+    asked = {"run": full_run, "format": "csv", "start": "1999-03-01T00:00:00Z", "end": end}
+    names = [
+        client.get(ROUTE, params=asked | {"grade": grade}).headers["Content-Disposition"]
+        for grade in ("raw", "smoothed")
+    ]
+    kinds = ("attitude", "attitude-smoothed")
+    assert names == [f'attachment; filename="XTE-{full_run}-{kind}-{days}.csv"' for kind in kinds]
+
+
 def test_a_format_from_outside_is_written_and_described(client, full_run, monkeypatch):
     def write(series):
         yield b" ".join(str(n).encode() for block in series.blocks for n in block.stretch)
