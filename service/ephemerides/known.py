@@ -31,9 +31,10 @@ STILL_RAD = 1e-5
 """Rotation in radians between records above which rates of zero count as missing."""
 MISSED_RAD, MISSED_SHARE = math.radians(0.05), 0.5
 """Least difference, in radians and as a share, of a step from its rates that contradicts them."""
-HELD_RAD, HELD_RAD_S = math.radians(0.5), math.radians(0.01)
-"""Least turn and rate of a body whose repeated attitude was not measured anew: more than the
-rounding of three decimals, and more than the bias of a gyro."""
+HELD_RAD, HELD_RAD_S, HELD_SHARE = math.radians(0.25), math.radians(0.01), 0.7
+"""Least turn and rate of a body whose repeated attitude was not measured anew, and the least share
+of the rates' turns that they make together: more than the rounding of three decimals, than the
+bias of a gyro, and than noise."""
 MEANT_SHARE = 0.1
 """Largest share of that difference that is left where rates are meant in another sign or unit."""
 FEWEST_STEPS = 3
@@ -197,9 +198,11 @@ def _is_held(repeats: Flags, expected: Vector, step_s: Vector) -> Flags:
     """
     runs = np.cumsum(~repeats)
     turns = [np.bincount(runs, np.where(repeats, axis, 0.0)) for axis in expected.T]
-    total_rad = np.linalg.norm(turns, axis=0)
+    turn_rad = np.linalg.norm(turns, axis=0)
+    path_rad = np.bincount(runs, np.where(repeats, np.linalg.norm(expected, axis=1), 0.0))
     passed_s = np.bincount(runs, np.where(repeats, step_s[:, 0], 0.0))
-    return np.asarray(((total_rad > HELD_RAD) & (total_rad > HELD_RAD_S * passed_s))[runs])
+    least_rad = np.maximum(HELD_RAD, np.maximum(HELD_SHARE * path_rad, HELD_RAD_S * passed_s))
+    return np.asarray((turn_rad > least_rad)[runs])
 
 
 def _require_own_rates(file: str, segment: Segment) -> None:
@@ -220,7 +223,7 @@ def _require_own_rates(file: str, segment: Segment) -> None:
     larger = np.maximum(by_steps, by_rates)
     near = larger <= QUARTER_TURN_RAD
     repeats = near & (q[1:] == q[:-1]).all(axis=1)
-    stands = repeats & ((by_rates > MISSED_RAD) | _is_held(repeats, expected, step_s))
+    stands = repeats & _is_held(repeats, expected, step_s)
     if stands.any():
         record = int(np.flatnonzero(stands)[0]) + 2
         message = "repeats the attitude before it, from which its rates turn the body"

@@ -110,6 +110,11 @@ def test_a_frozen_attitude_is_found_over_small_steps_and_a_biased_gyro_is_not_on
     with pytest.raises(BadFile, match="record 202: repeats the attitude before it"):
         read(rows_at(frozen, 0.4, 0.1), tmp_path)
     assert len(read(rows_at([30.0] * 600, 0.005, 1.0), tmp_path)) == 600
+    rng = np.random.default_rng(5)
+    for noise, step_s in ((0.05, 1.0), (0.003, 10.0), (0.001, 60.0)):
+        text = rows_at([30.0] * 50, 0.0, step_s)
+        noisy = [f"{line[:-3]}{noise * rng.standard_normal()}" for line in text.splitlines()[1:]]
+        assert len(read("\n".join([text.splitlines()[0], *noisy]), tmp_path)) == 50
 
 
 def test_rows_that_are_there_twice_are_refused_by_name(tmp_path):

@@ -121,6 +121,8 @@ def test_the_overview_of_a_run_without_limits_says_that_its_alarms_are_off(clien
 
 def test_the_list_of_alarms_begins_with_the_worst_now(small_fleet):
     app, client = small_fleet
+    value = {f"{which}_value": 99.0 for which in ("latest", "worst")}
+    fleet.put_alarm(app, "SAT-003", [("raised", 0.5)], bound=1.0, severity="critical", **value)
     page = client.get("/alarms").raise_for_status().text
     shown = re.findall(r'href="/alarms/([0-9A-Z]{26})"', page)
     first, *_ = app.spacecraft.alarms("live")

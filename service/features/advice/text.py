@@ -84,6 +84,13 @@ def mission_lines(advice: Advice) -> str:
     for each in advice.changes:
         tables.setdefault((each.table, each.tracker or ""), []).append(each.line)
     return "\n".join(
-        "\n".join([f'[[trackers]]\nname = "{tracker}"' if tracker else f"[{table}]", *lines])
+        "\n".join(
+            [
+                f'[[trackers]] # the table of this tracker\nname = "{tracker}"'
+                if tracker
+                else f"[{table}]",
+                *lines,
+            ]
+        )
         for (table, tracker), lines in sorted(tables.items())
     )

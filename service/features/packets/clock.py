@@ -86,6 +86,8 @@ def _is_other_epoch(time: PacketTime, counted: str) -> bool:
         epoch, scale = _EPOCHS.get(counted.upper()) or (datetime.fromisoformat(counted), "")
     except ValueError:
         return False
+    if epoch.tzinfo is not None:
+        epoch = epoch.astimezone(UTC).replace(tzinfo=None)
     if isinstance(time, CdsTime):
         return epoch.date() != time.epoch
     if scale:
@@ -94,7 +96,7 @@ def _is_other_epoch(time: PacketTime, counted: str) -> bool:
             return True
         apart_s = behind_tai_s.get(time.scale, 0) - behind_tai_s.get(scale, 0)
         return time.epoch + timedelta(seconds=apart_s) != epoch
-    return abs((epoch.replace(tzinfo=None) - time.epoch).total_seconds()) > _EPOCH_S
+    return abs((epoch - time.epoch).total_seconds()) > _EPOCH_S
 
 
 @dataclass(frozen=True, slots=True)

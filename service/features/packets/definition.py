@@ -514,12 +514,18 @@ def _kind_of(
         return ParameterKind("text")
     if encoding == "BinaryDataEncoding":
         return ParameterKind("binary")
-    unit = (parameter_type.unit or "").strip()
+    # A unit of several, such as m/s, is a tuple: no unit of time.
+    unit = parameter_type.unit.strip() if isinstance(parameter_type.unit, str) else ""
     if name not in ("AbsoluteTime", "RelativeTime"):
         return ParameterKind("number", unit=unit)
     calibrator = parameter_type.encoding.default_calibrator
-    factors = [each.coefficient for each in getattr(calibrator, "coefficients", ())]
-    scale = next((float(each) for each in factors if not float(each).is_integer()), 1.0)
+    factors = [
+        float(each.coefficient)
+        for each in getattr(calibrator, "coefficients", ())
+        if each.exponent == 1
+    ]
+    # A whole factor is applied when packets are read, and leaves a count.
+    scale = next((each for each in factors if not each.is_integer()), 1.0)
     return ParameterKind("number", {}, unit, (parameter_type.epoch or "").strip(), scale)
 
 

@@ -14,7 +14,7 @@ from service.features.products.attitudes import AttitudeSeries, ProductGrade, tu
 from service.features.products.part import TABLE_KINDS, Products
 from service.missions.product_settings import MAX_LARGEST_GAP_S
 from service.table_files.formats import TABLE_FORMATS
-from service.times import DAY_S, Utc, bucket_start, parse_utc, shifted
+from service.times import DAY_S, Utc, bucket_start, parse_utc, recorded_utc
 from service.web.console.formatting import completed_utc
 from service.web.console.page import ContextDep, FromQuery, PageContext, console_page
 from service.web.console.pages.period import without_gyro
@@ -133,6 +133,7 @@ def files_page(name: str, query: FromQuery[FilesQuery], context: ContextDep) -> 
         name=name,
         query=query,
         stretch=shown,
+        is_stale=_is_stale(context, name, query, shown) if shown else False,
         days=_days(shown.start) if shown else {},
         grades=_grades(context, name, query, shown) if shown else [],
         attitude_formats=attitude_formats(),
@@ -171,10 +172,20 @@ def _grades(
     return found
 
 
+def _is_stale(context: PageContext, name: str, query: FilesQuery, shown: ShownPeriod) -> bool:
+    """True if the latest batch of a period came after its definitive attitude was made."""
+    made = context.app.part(Products).made_at(name, query.run, shown.start, shown.end)
+    latest = context.app.results.page(
+        spacecraft=name, run=query.run, start=shown.start, end=shown.end, limit=1
+    ).items
+    return bool(made and latest and recorded_utc(latest[0].created).tai_ns > made.tai_ns)
+
+
 def _days(shown: Utc) -> dict[str, str]:
     """Date of a shown day and its neighbours, as in an address."""
-    at = {"before": -DAY_S, "shown": 0.0, "after": DAY_S}
-    return {name: shifted(shown, offset_s).text[:10] for name, offset_s in at.items()}
+    number = shown.bucket(DAY_S)
+    at = {"before": number - 1, "shown": number, "after": number + 1}
+    return {name: bucket_start(day, DAY_S).text[:10] for name, day in at.items()}
 
 
 def _counted(
@@ -186,7 +197,9 @@ def _counted(
     last = None
     for block in islice(series.blocks, MOST_COUNTED):
         if covers is None:
-            covers = parse_utc(block.time[0]), parse_utc(next(iter(newest.blocks)).time[0])
+            # Batches may be pruned meanwhile.
+            latest = next(iter(newest.blocks), block)
+            covers = parse_utc(block.time[0]), parse_utc(latest.time[0])
         attitudes += len(block)
         rows = block if last is None else last.followed_by(block)
         begins = np.diff(rows.stretch) != 0

@@ -22,7 +22,7 @@ from service.observations.schema import LIVE
 from service.settings import Settings
 from service.storage.gyro import BlockFilter, count_samples, sample_table
 from service.storage.projections.heads import newest_head
-from service.storage.queries.definitive import count_samples_of, definitive_pages
+from service.storage.queries.definitive import count_samples_of, definitive_pages, made_at
 from service.storage.queries.histories import retired
 from service.storage.queries.pages import ResultFilter, count
 from service.storage.store import Store
@@ -111,6 +111,11 @@ class Products:
             about = replace(about, largest_gap_s=self._gap_of_cadence(about, selected))
         pages = self._pages(about, selected, newest_first=about.newest_first)
         return attitude_series.series_of(about, pages)
+
+    def made_at(self, name: str, run: str, start: Utc, end: Utc) -> Utc | None:
+        """Time when the newest definitive attitude of a period's days was made; None: of none."""
+        with self._store.reading() as connection:
+            return made_at(connection, ResultFilter(run, name, start, end))
 
     def _record_head(self) -> str:
         with self._store.reading() as connection:

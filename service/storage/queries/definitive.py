@@ -25,7 +25,7 @@ from service.storage.gyro import inside
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.time_buckets import buckets_between
 from service.storage.sql.definitive_tables import INNOVATIONS, graded_blocks, graded_days
-from service.times import DAY_S
+from service.times import DAY_S, Utc, recorded_utc
 from service.trends.limits import Sample
 
 METHODS: dict[Grade, str] = {"filtered": "ekf", "smoothed": "filter_smoother"}
@@ -109,6 +109,19 @@ def count_samples_of(connection: Connection, selected: ResultFilter, grade: Grad
         graded_days, graded_blocks, graded_blocks.c.day_id == graded_days.c.id
     )
     return int(connection.scalar(total.where(*block_conditions(selected, grade))) or 0)
+
+
+def made_at(connection: Connection, selected: ResultFilter) -> Utc | None:
+    """Time when the newest revision of a period's days was made; None without any."""
+    days = graded_days.c
+    newest = select(func.max(days.created)).where(
+        days.current,
+        days.spacecraft == selected.spacecraft,
+        days.run == selected.run,
+        *buckets_between(days.day, selected.start, selected.end, DAY_S),
+    )
+    text = connection.scalar(newest)
+    return None if text is None else recorded_utc(text)
 
 
 def block_conditions(selected: ResultFilter, kind: str) -> list[ColumnElement[bool]]:

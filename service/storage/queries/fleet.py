@@ -119,6 +119,10 @@ def fleet_rows(
     return as_of, tuple(_row(each, facts, run, now, active) for each in found)
 
 
+MOST_DOUBLINGS = 64
+"""Excess of a value that has fallen to zero below its bound."""
+
+
 def present_rank(alarm: Alarm) -> tuple[bool, int, int]:
     """Sort key of an alarm: shelved ones lowest, then present severity, then excess over the bound.
 
@@ -133,12 +137,14 @@ def present_rank(alarm: Alarm) -> tuple[bool, int, int]:
 
 def _doublings_beyond(alarm: Alarm) -> int:
     """Number of doublings by which the latest value of an alarm is beyond its bound."""
-    value, bound = alarm.latest.value, alarm.raised.bound
-    if min(value, bound) <= 0 or not math.isfinite(value):
+    value, bound = abs(alarm.latest.value), abs(alarm.raised.bound)
+    # The bound is that of the worst severity so far, and is no measure of a lower one.
+    if alarm.current_severity != alarm.severity or not bound or not math.isfinite(value):
         return 0
-    doublings = math.log2(value / bound)
-    # The bound is that of the worst severity so far: the worst value tells on which side it is.
-    return max(0, int(doublings if alarm.worst.value >= bound else -doublings))
+    is_above = abs(alarm.worst.value) >= bound
+    least = bound / 2**MOST_DOUBLINGS
+    doublings = math.log2(max(value, least) / bound)
+    return min(MOST_DOUBLINGS, max(0, int(doublings if is_above else -doublings)))
 
 
 def summary(found: Sequence[Alarm]) -> AlarmSummary:

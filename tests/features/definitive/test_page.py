@@ -9,12 +9,14 @@ from types import SimpleNamespace
 import httpx
 import numpy as np
 import pytest
+from sqlalchemy import update
 
 from service.app.factory import open_app
 from service.attitude.definitive import Status
 from service.features.definitive.charts import definitive_charts, direction_chart
 from service.features.definitive.part import Definitive
 from service.missions.mission import load_missions
+from service.storage.sql.definitive_tables import graded_days
 from service.times import parse_utc, shifted
 from service.vectors import matrix_from_quaternion
 from service.web.app import create_app
@@ -272,6 +274,10 @@ def test_files_say_that_a_grade_falls_short_of_the_batches_and_jobs_link_their_f
         assert "make it again" not in client.get(link).text
         late = attitudes_of(truth, np.arange(6000, 6800, 8), (6.0, 6.0, 40.0), rng)
         put_pass(app, recorded_of(gyro.tai_ns[~first], gyro.rate_rad_s[~first], late))
+        # The records of a pass are of their own time, before the attitude was made.
+        assert "make it again" not in client.get(link).text
+        early = update(graded_days).values(created=NOON.text)
+        app.context.change(lambda connection: connection.execute(early))
         text = text_of(client.get(link).text)
         assert text.count("UTC: make it again") == 2, text
 

@@ -77,6 +77,13 @@ def test_a_range_of_numbers_has_one_label():
     assert len(read(described=described)[0]) == 3
 
 
+def test_a_unit_of_several_is_no_reason_to_refuse_the_file():
+    of_speed = '<UnitSet><Unit>m</Unit><Unit power="-1">s</Unit></UnitSet><IntegerDataEncoding '
+    head, kind, rest = XTCE.partition('name="U3" signed="false"><IntegerDataEncoding ')
+    described = head + kind.replace("<IntegerDataEncoding ", of_speed) + rest
+    assert len(read(described=described)[0]) == 3
+
+
 BOOLEAN = XTCE.replace("Enumerated", "Boolean").replace(LABELS + "</EnumerationList>", "")
 
 

@@ -119,6 +119,27 @@ TIMES = {
         {},
         2.0,
     ),
+    "an exposure with pauses": (
+        {"DATE-OBS": NOON, "XPOSURE": 5.0, "TELAPSE": 10.0, "TIMEUNIT": "s"},
+        {},
+        5.0,
+    ),
+    "two exposures with units of their own": (
+        {
+            "DATE-OBS": NOON,
+            "XPOSURE": 4.0 / 86400,
+            "TIMEUNIT": "d",
+            "EXPTIME": 4.0,
+            "EXPUNIT": "[s]",
+        },
+        {},
+        2.0,
+    ),
+    "a unit that is none of time": (
+        {"DATE-OBS": NOON, "EXPTIME": 4.0, "EXPUNIT": "electron/s"},
+        {},
+        2.0,
+    ),
     "an elapsed time that is not given": (
         {"DATE-OBS": NOON, "EXPTIME": 4.0, "TELAPSE": 0},
         {},
@@ -301,9 +322,9 @@ NO_TIMES = {
         {"DATE-OBS": NOON, "EXPTIME": 500, "TIMEUNIT": "ms"},
         "EXPTIME is 500 without a unit, and TIMEUNIT is ms",
     ),
-    "an exposure with pauses": (
-        {"DATE-OBS": NOON, "XPOSURE": 5.0, "TELAPSE": 10.0, "TIMEUNIT": "s"},
-        "TELAPSE is 10 s, and the exposure is 5 s",
+    "an elapsed time shorter than the exposure": (
+        {"DATE-OBS": NOON, "XPOSURE": 10.0, "TELAPSE": 5.0, "TIMEUNIT": "s"},
+        "TELAPSE is 5 s, and the exposure is 10 s",
     ),
     "exposures that a camera added": (
         {"DATE-OBS": NOON, "EXPTIME": 4.0, "COADDS": 10},

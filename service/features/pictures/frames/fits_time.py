@@ -212,9 +212,14 @@ def _seconds(header: Header, key: str) -> tuple[float, str]:
         number, unit = repr(value), ""
     else:
         raise ValueError(f"{key} is no number")
-    cards: tuple[str, ...] = EXPOSURE_UNITS if key in EXPOSURES else ()
-    cards += ("TIMEUNIT",) if key in OF_TIMEUNIT else ()
-    common = [str(header.cards[each]).strip() for each in cards if header.cards.get(each)]
+    if key in OF_TIMEUNIT:
+        common = [str(header.cards.get("TIMEUNIT") or "").strip()]
+    else:
+        stated_units = (str(header.cards.get(each) or "") for each in EXPOSURE_UNITS)
+        common = [each.strip(" [].") for each in stated_units]
+        # Cards outside the standard may hold any word.
+        common = [each for each in common if each.lower() in _UNITS_S]
+    common = [each for each in common if each]
     own = [_scale_of_unit(each, key) for each in (unit, *common) if each]
     stated = _stated_scales(comment, key)
     shown = " ".join([str(value), *common])
@@ -299,9 +304,11 @@ class _DateCards:
             if late or early:
                 raise _NoTime("the average time is not between start and end")
             return middle, f"{next(iter(averages))} (middle of the exposure)"
-        self._require_one_exposure(lasted_s)
+        elapsed_s = self._elapsed_s(lasted_s)
         begun = f"{next(iter(starts), '')} (start of the exposure)"
         ended, lasted = f"{next(iter(ends), '')} (end of the exposure)", self.exposure.source
+        if elapsed_s is not None:
+            exposure_s, lasted = elapsed_s, "TELAPSE"
         if start is not None and exposure_s is not None:
             return shifted(start, 0.5 * exposure_s), f"{begun} and {lasted}"
         if start is not None and lasted_s is not None:
@@ -355,22 +362,26 @@ class _DateCards:
             if isinstance(clock, str) and clock.strip()[-8:] == shown[11:19]:
                 raise _NoTime(f"DATE-OBS is {shown}, the local time of {key}")
 
-    def _require_one_exposure(self, lasted_s: float | None) -> None:
-        """Raise `_NoTime` for a stack of exposures whose end is not stated."""
+    def _elapsed_s(self, lasted_s: float | None) -> float | None:
+        """Seconds from start to end by TELAPSE, where no end is stated and it is the longer one.
+
+        Raises `_NoTime` for a stack of exposures whose end is not stated.
+        """
         for key in STACKED if lasted_s is None else ():
             count = self.header.cards.get(key)
             if isinstance(count, (int, float)) and count > 1:
                 raise _NoTime(f"it is a stack of {count:g} exposures ({key}) without DATE-END")
         exposure_s = self.exposure.seconds
         if lasted_s is not None or exposure_s is None or self.header.cards.get("TELAPSE") is None:
-            return
+            return None
         try:
             elapsed_s, _ = _seconds(self.header, "TELAPSE")
         except (ValueError, _Contradictory):
-            return
-        # A value of zero is none.
-        if elapsed_s > 0.0 and abs(elapsed_s - exposure_s) > 2 * SAME_S:
+            return None
+        # A value of zero is none; pauses of the exposure make it longer.
+        if 0.0 < elapsed_s < exposure_s - 2 * SAME_S:
             raise _NoTime(f"TELAPSE is {elapsed_s:g} s, and the exposure is {exposure_s:g} s")
+        return elapsed_s if elapsed_s > exposure_s else None
 
     def _missing(self, moment: Utc | None) -> str:
         problems = "".join(f"; {each}" for each in (*self.problems, self.exposure.problem) if each)

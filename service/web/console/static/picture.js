@@ -108,7 +108,12 @@ function save(button) {
   for (const svg of whole.querySelectorAll("svg")) if (!svg.closest("details")) drawSvg(pen, svg, toSheet);
   const texts = document.createTreeWalker(whole, NodeFilter.SHOW_TEXT);
   while (texts.nextNode()) drawWords(pen, texts.currentNode);
-  element("a", { href: sheet.toDataURL(), download: `${[page, title, run].join(" ").replace(/[^\w.-]+/g, "-")}.png` }).click();
+  const href = sheet.toDataURL();
+  if (href.length < 100) {
+    button.textContent = "The picture is too large for this browser";
+    return;
+  }
+  element("a", { href, download: `${[page, title, run].join(" ").replace(/[^\w.-]+/g, "-")}.png` }).click();
 }
 
 document.addEventListener("click", ({ target }) => {

@@ -267,6 +267,7 @@ export class Trend {
       return;
     }
     const { moments, pick } = withGaps(history);
+    this.moments = new Set(moments);
     const scale = this.definition.percent ? 100 : 1;
     const scaled = (values) => pick(values).map((value) => (value === null || value === undefined ? null : value * scale));
     let data = [moments];
@@ -376,9 +377,10 @@ export class Trend {
       return;
     }
     const parts = this.known.map(({ label }, k) => {
-      const at = this.nearest(3 * k + 1, index, this.history);
+      // At a moment of another spacecraft alone the nearest own value is told.
+      const at = this.moments.has(this.data[0][index]) ? index : this.nearest(3 * k + 1, index, this.history);
       const [mean, min, max] = [1, 2, 3].map((each) => this.data[3 * k + each][at]);
-      const spread = at === undefined || min === max ? "" : ` (${this.text(min)} to ${this.text(max)})`;
+      const spread = at === undefined || mean === null || min === max ? "" : ` (${this.text(min)} to ${this.text(max)})`;
       return `${this.own}${label} ${this.text(mean)}${spread}`;
     });
     const beside = this.others.map((other, k) => {
@@ -390,11 +392,11 @@ export class Trend {
     this.readout.style.minHeight = `${this.readout.offsetHeight}px`;
   }
 
-  // Spacecraft have times of their own: the place of a column's value nearest in time, within the usual step of its history.
+  // Spacecraft have times of their own: the place of a column's value nearest in time, within half the usual step of its history.
   nearest(column, index, history) {
     const [times, values] = [this.data[0], this.data[column]];
     const [step, away] = [usualStep(history), (place) => Math.abs(times[place] - times[index])];
-    const known = [...times.keys()].filter((place) => values[place] !== null && values[place] !== undefined && away(place) <= step);
+    const known = [...times.keys()].filter((place) => values[place] !== null && values[place] !== undefined && away(place) <= step / 2);
     return known.sort((a, b) => away(a) - away(b))[0];
   }
 
