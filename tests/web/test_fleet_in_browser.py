@@ -151,6 +151,17 @@ def test_without_scripts_the_rows_are_all_there(filled):
     assert page.count('<tr class="trouble">') == fleet.IN_TROUBLE
 
 
+def test_on_a_narrow_screen_what_is_done_to_alarms_stands_beside_the_selection(browser, filled):
+    _, address = filled
+    browser.open(f"{address}/alarms", width=400)
+    place = "document.querySelector('#bulk [data-act=acknowledge]').getBoundingClientRect()"
+    is_seen = f"(b => b.height > 0 && b.top >= 0 && b.bottom <= innerHeight)({place})"
+    assert not browser.run(is_seen)
+    browser.run("document.querySelector('[data-select]').click()")
+    assert browser.run(is_seen)
+    assert faults(browser) == []
+
+
 def test_many_alarms_are_acknowledged_at_once_and_the_header_counts_down(browser, filled):
     _, address = filled
     browser.open(f"{address}/alarms")

@@ -163,6 +163,21 @@ def test_a_time_in_any_common_form_finds_the_batch(small_fleet, typed):
     assert "A batch at 1999-03-01 (060) 12:00:00 UTC" in page
 
 
+@pytest.mark.parametrize(
+    ("typed", "meant"),
+    [
+        ("300/12:00", "1998-300T12:00:00Z"),
+        ("12-01 05:00", "1998-12-01T05:00:00Z"),
+        ("061/01:00", "1999-061T01:00:00Z"),
+        ("09:40", "1999-03-01T09:40:00Z"),
+        ("04:40", "1999-03-02T04:40:00Z"),
+    ],
+)
+def test_a_time_without_its_year_or_day_is_the_last_such_time(typed, meant):
+    """Asked of the record, the time is past: it is no later than the latest batch."""
+    assert formatting.completed_utc(typed, parse_utc("1999-03-02T05:12:00Z")) == meant
+
+
 def test_a_time_finds_the_nearest_batch_of_every_spacecraft_if_none_is_chosen(small_fleet):
     _, client = small_fleet
     page = client.get("/batches", params={"find": "1999-03-01 12:00"})

@@ -280,7 +280,8 @@ def _related(context: PageContext, alarm: AlarmWithActions) -> list[tuple[Alarm,
     """Active alarms that may share a cause with another alarm, each with the reason.
 
     The same quantity of other spacecraft, and other quantities of this one, if they left their
-    limits at about the same time; and others of the same tracker.
+    limits at about the same time; and others of the same tracker or
+    quantity.
     """
     raised_ns = recorded_utc(alarm.raised.time).tai_ns
 
@@ -291,6 +292,8 @@ def _related(context: PageContext, alarm: AlarmWithActions) -> list[tuple[Alarm,
         if is_together and (is_same or other.quantity == alarm.quantity):
             what = "same spacecraft" if is_same else "same quantity"
             return f"{what}, raised {age(apart_s)} apart" if apart_s else f"{what}, same time"
+        if is_same and other.quantity == alarm.quantity:
+            return "same quantity"
         is_tracker = is_same and other.tracker == alarm.tracker is not None
         return "same tracker" if is_tracker else ""
 

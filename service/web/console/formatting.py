@@ -85,7 +85,8 @@ def completed_utc(text: str, near: Utc | None = None) -> str:
             return text
         if month or ordinal:
             days = int(ordinal) if ordinal else 30.6 * (int(month) - 1) + int(day)
-            year = str(int(near.text[:4]) + round((near.day_of_year - days) / 366))
+            # The last such day, but for what the length of months is off.
+            year = str(int(near.text[:4]) - (days > near.day_of_year + 3))
         else:
             # The last day on which this time of day is not after the given one, but for a minute.
             last = shifted(near, 60.0 - 60.0 * (60 * int(hour) + int(minute)))
