@@ -148,6 +148,9 @@ def batch_page(request: Request, id: ResultId, context: ContextDep) -> Response:
         options=options.model_dump(exclude_none=True, exclude_unset=True),
         toml=toml_of(fields),
         adoption=adoption(answer, shown),
+        signatures=context.app.results.signatures(
+            {each.id: each.parent for each in record.what_ifs}
+        ),
         putting_back=_putting_back(context, record),
         pointing=_pointing(shown),
         timings_us=structs.asdict(shown.timings_us),
