@@ -246,7 +246,7 @@ def test_a_cursor_of_another_list_is_refused(client, night):
 def test_the_samples_of_a_period_are_a_table(client, night):
     asked = {"run": night, "start": later(9.5), "end": later(20.5)}
     answer = client.get(TABLE, params=asked)
-    assert "night-gyro.csv" in answer.headers["Content-Disposition"]
+    assert "night-gyro-1999-03-01.csv" in answer.headers["Content-Disposition"]
     rows = list(csv.DictReader(io.StringIO(answer.text)))
     assert [row["time"] for row in rows] == [later(9.5 + 0.5 * k) for k in range(22)]
     assert [row["block"] for row in rows] == ["block 00"] + ["block 01"] * 20 + ["block 02"]
