@@ -53,7 +53,8 @@ _EPOCH_S = 70.0
 _UNITS = {"s": 1.0, "sec": 1.0, "second": 1.0, "d": 86400.0, "day": 86400.0, "min": 60.0}
 _UNITS |= {"ms": 1e-3, "msec": 1e-3, "millisecond": 1e-3, "ns": 1e-9, "nanosecond": 1e-9}
 _UNITS |= {"us": 1e-6, "usec": 1e-6, "microsecond": 1e-6, "minute": 60.0, "hour": 3600.0}
-_UNITS |= {"h": 3600.0, "hr": 3600.0, "millisec": 1e-3, "microsec": 1e-6, "usec": 1e-6, "µs": 1e-6}
+_UNITS |= {"h": 3600.0, "hr": 3600.0, "millisec": 1e-3, "microsec": 1e-6}
+_UNITS |= {"µs": 1e-6, "μs": 1e-6}
 """Seconds of a unit of time; units in the plural have an s after it."""
 
 

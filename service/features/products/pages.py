@@ -1,6 +1,7 @@
 """Console page of export files: attitudes of a period by grade, and tables."""
 
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from typing import Annotated
 from urllib.parse import quote, urlencode
@@ -151,23 +152,16 @@ def _grades(
     products = context.app.part(Products)
     missing = without_gyro(context, name, query.run, shown)
     for grade, what in GRADES.items():
-        series = products.attitudes(
+        read = partial(
+            products.attitudes,
             name,
             run=query.run,
             start=shown.start,
             end=shown.end,
             grade=grade,
-            largest_gap_s=query.gap_s,
         )
-        newest = products.attitudes(
-            name,
-            run=query.run,
-            start=shown.start,
-            end=shown.end,
-            grade=grade,
-            order="newest",
-            largest_gap_s=series.about.largest_gap_s,
-        )
+        series = read(largest_gap_s=query.gap_s)
+        newest = read(order="newest", largest_gap_s=series.about.largest_gap_s)
         found.append(_counted(grade, what, missing, series, newest))
     return found
 

@@ -19,7 +19,7 @@ from jinja2.runtime import Context
 from markupsafe import Markup
 from pydantic import Field
 from starlette.exceptions import HTTPException
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import HTMLResponse, Response
 
 from service import __version__, logs
@@ -435,15 +435,18 @@ class PageRoute(APIRoute):
                 if isinstance(error, Busy):
                     answer.headers["Retry-After"] = str(error.retry_after_s)
                 return below_path(request, answer)
-            except HTTPException:
+            except (HTTPException, ClientDisconnect):
+                # The app has answers of its own to these.
                 raise
             except Exception as error:
+                # A fault of the service: whoever opened the page reads a page, not JSON.
                 return _failed(request, error)
 
         return handler
 
 
 def _failed(request: Request, error: Exception) -> Response:
+    """Page about an unexpected error, which is logged."""
     problems.internal_error(request, error)
     return below_path(request, _error_page(problems.INTERNAL_ERROR, problems.FAILED))
 

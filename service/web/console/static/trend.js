@@ -395,9 +395,12 @@ export class Trend {
   // Spacecraft have times of their own: the place of a column's value nearest in time, within half the usual step of its history.
   nearest(column, index, history) {
     const [times, values] = [this.data[0], this.data[column]];
-    const [step, away] = [usualStep(history), (place) => Math.abs(times[place] - times[index])];
-    const known = [...times.keys()].filter((place) => values[place] !== null && values[place] !== undefined && away(place) <= step / 2);
-    return known.sort((a, b) => away(a) - away(b))[0];
+    let [found, least] = [undefined, usualStep(history) / 2];
+    times.forEach((time, place) => {
+      const away = Math.abs(time - times[index]);
+      if ((values[place] ?? null) !== null && away <= least) [found, least] = [place, away];
+    });
+    return found;
   }
 
   get own() {
